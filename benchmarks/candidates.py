@@ -6,6 +6,7 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
+from pipeline.extras.footprints.given_footprints import footprints_of_run
 from pipeline.io import ReadOptions
 from pipeline.model import Candidate
 from pipeline.runtime.cluster.serial_executor import SerialExecutor
@@ -14,7 +15,6 @@ from pipeline.runtime.plan import make_plan
 from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.stages.gather import gather
-from pipeline.runtime.stages.given_footprints import footprints_of_run
 from pipeline.runtime.stages.ground import find_ground
 from pipeline.runtime.stages.join import join
 from pipeline.runtime.stages.read_inputs import read_inputs

@@ -219,9 +219,9 @@ def load() -> None:
 
     import pipeline.batch.run
     import pipeline.cli
-    import pipeline.io.ascii
+    import pipeline.extras.ply_ascii.ascii
+    import pipeline.extras.ply_ascii.ply
     import pipeline.io.las
-    import pipeline.io.ply
     import pipeline.ruler.evaluation.reading.run  # noqa: F401
     from pipeline.runtime.isolation.fork_server import load_all
     from pipeline.runtime.isolation.preloading import loads_of

@@ -29,6 +29,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from pipeline.extras.compare.compare import Variant, run_variants, settings_of
 from pipeline.io.source import ReadOptions
 from pipeline.methods import METHODS
 from pipeline.ruler.evaluation.evaluate import Evaluation, evaluate
@@ -41,7 +42,6 @@ from pipeline.ruler.evaluation.writing import write_tables
 from pipeline.ruler.simulation.dataset import simulate
 from pipeline.ruler.simulation.seeds import seed_of
 from pipeline.ruler.simulation.sweep import CELLS, Cell
-from pipeline.runtime.compare import Variant, run_variants, settings_of
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.resources import SERIAL
 from pipeline.settings import RunSettings

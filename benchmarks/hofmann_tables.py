@@ -27,9 +27,9 @@ from types import MappingProxyType
 import numpy as np
 
 from benchmarks.entries import Workplace, all_variants, fill_page, hofmann_entries, markdown_table, measure_all
+from pipeline.extras.compare.compare import Variant
 from pipeline.model import BoolArray, RoofType
 from pipeline.ruler.evaluation.bootstrap import Estimate, bootstrap, share
-from pipeline.runtime.compare import Variant
 
 OUTCOMES = ("correct", "passable", "false")
 KINDS = tuple(kind.value for kind in (RoofType.FLAT, RoofType.PENT, RoofType.GABLE, RoofType.HIP, RoofType.COMBINATION))

@@ -44,12 +44,12 @@ from benchmarks.entries import Entry, Workplace, fill_page, markdown_table, run_
 from benchmarks.run_scores import RunScore, score_run
 from benchmarks.survey_runs import Seconds, candidates_of, run_survey
 from benchmarks.thinned_surveys import roof_density, thinned, write_changed
+from pipeline.extras.compare.compare import Variant, settings_of
 from pipeline.io import ReadOptions
 from pipeline.model import FloatArray
 from pipeline.recipe import reconstruct_building
 from pipeline.ruler.evaluation.reference import Reference
 from pipeline.ruler.evaluation.reference_points import read_points_reference
-from pipeline.runtime.compare import Variant, settings_of
 
 PARTS = ("times", "seconds", "thinned")
 """What can be left out."""

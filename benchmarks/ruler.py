@@ -31,9 +31,9 @@ from benchmarks.entries import (
     measure_all,
     sweep_entries,
 )
+from pipeline.extras.compare.compare import Variant
 from pipeline.model import Status
 from pipeline.ruler.simulation.seeds import seed_of
-from pipeline.runtime.compare import Variant
 
 QUALITY = "faces.quality_10m2"
 """Measure of the tables of the sweep: TP / (TP + FP + FN)."""

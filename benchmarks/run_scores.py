@@ -18,7 +18,7 @@ from pipeline.export.geoparquet import read_table
 from pipeline.ruler.evaluation.models import RoofModel
 from pipeline.ruler.evaluation.reading import read_models
 from pipeline.ruler.evaluation.reference import Reference
-from pipeline.ruler.evaluation.residuals import building_residuals
+from pipeline.ruler.evaluation.residuals import RMSE, building_residuals
 from pipeline.ruler.evaluation.validity import validity
 
 LOD2 = "2.2"
@@ -70,9 +70,10 @@ def score_run(run: Path, reference: Reference, val3dity: str | None = None) -> R
     lod2 = {model.building_id for model in found.models if _is_lod2(model)}
     valid = {row.building_id for row in validity(found) if row.is_valid}
     by_val3dity = None if val3dity is None else valid_by_val3dity(run, val3dity)
-    rows = building_residuals(found.models, reference)
-    all_points, top_visible = [row.all_points for row in rows], [row.top_visible for row in rows]
-    points = sum(one.n_points for one in all_points)
+    residuals = building_residuals(found.models, reference)
+    (points, covered, within), (points_top, _, within_top) = (
+        one.counts.sum(axis=0).tolist() for one in (residuals.all_points, residuals.top_visible)
+    )
     reasons = collections.Counter(read_table(str(run), "buildings").column("reason").to_pylist())
     return RunScore(
         candidates=len(found.models) + len(found.failed),
@@ -87,11 +88,11 @@ def score_run(run: Path, reference: Reference, val3dity: str | None = None) -> R
         else sum(model.building_id in by_val3dity for model in found.models),
         roof_faces=sum(len(model.surfaces) for model in found.models),
         points=points,
-        coverage=_ratio(sum(one.n_covered for one in all_points), points),
-        within=_ratio(sum(one.n_within for one in all_points), points),
-        within_top=_ratio(sum(one.n_within for one in top_visible), sum(one.n_points for one in top_visible)),
-        rmse_median_m=_median([one.rmse_m for one in all_points]),
-        rmse_top_median_m=_median([one.rmse_m for one in top_visible]),
+        coverage=_ratio(covered, points),
+        within=_ratio(within, points),
+        within_top=_ratio(within_top, points_top),
+        rmse_median_m=_median(residuals.all_points.figure(RMSE).tolist()),
+        rmse_top_median_m=_median(residuals.top_visible.figure(RMSE).tolist()),
     )
 
 

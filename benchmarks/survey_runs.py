@@ -12,8 +12,8 @@ from pathlib import Path
 
 from benchmarks.candidates import found_scene
 from benchmarks.entries import Entry
+from pipeline.extras.compare.compare import Variant
 from pipeline.model import Candidate
-from pipeline.runtime.compare import Variant
 from pipeline.settings import RunSettings
 
 _ROOT = Path(__file__).resolve().parents[1]

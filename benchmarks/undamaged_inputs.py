@@ -19,7 +19,7 @@ import shapely.affinity
 
 from pipeline.model import FloatArray
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "support"))
 
 from las_files import copc_of, write_las
 

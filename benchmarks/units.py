@@ -22,8 +22,8 @@ import shapely
 
 from benchmarks.candidates import found_scene
 from benchmarks.entries import markdown_table
+from pipeline.extras.footprints.footprints_file import read_footprints
 from pipeline.io import ReadOptions, open_source
-from pipeline.io.footprints import read_footprints
 from pipeline.model import IntArray
 from pipeline.ruler.evaluation.reference_truth import read_truth_reference
 from pipeline.ruler.simulation.dataset import simulate

@@ -28,11 +28,11 @@ from benchmarks.entries import fill_page, markdown_table
 from benchmarks.ground import DATA, measured, product_filter, samples
 from benchmarks.thinned_surveys import thinned, write_changed
 from pipeline.export.geoparquet import read_table
+from pipeline.extras.classify.classify import ClassifyRequest, classify
 from pipeline.model import BoolArray, Status
 from pipeline.ruler.evaluation.evaluate import evaluate
 from pipeline.ruler.evaluation.reading import read_models
 from pipeline.ruler.evaluation.reading.wireframes import read_wireframes
-from pipeline.runtime.classify import ClassifyRequest, classify
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.resources import SERIAL
 from pipeline.runtime.run import run

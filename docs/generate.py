@@ -1,6 +1,6 @@
 """Writes the pages of docs/reference/ that can be generated from the code.
 
-`make docs` runs it; tests/00_house/test_docs.py fails if a page differs from the code.
+`make docs` runs it; tests/house/test_docs.py fails if a page differs from the code.
 """
 
 from __future__ import annotations
@@ -16,8 +16,11 @@ import typer
 from pipeline.batch.batch_file import TABLES
 from pipeline.cli import command_line as built
 from pipeline.console import EXIT_CODES
-from pipeline.export import cityjson, geopackage, party_wall_tables, pmtiles, solar_table
+from pipeline.export import cityjson
 from pipeline.export.columns import COLUMNS, KINDS, TILE_COLUMN, Column
+from pipeline.extras.party_walls import party_wall_tables
+from pipeline.extras.publish_gis import geopackage, pmtiles
+from pipeline.extras.solar import solar_table
 from pipeline.methods import METHODS
 from pipeline.parameters import Parameters
 from pipeline.quality import validity as checker

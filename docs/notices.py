@@ -2,7 +2,7 @@
 
 `make docs` runs it. Names and versions come from requirements.lock and from the locked packages of the web page;
 licences, sources and native libraries from the installed wheels. Only the licences of native libraries are written
-here, since most wheels do not state them. tests/00_house/test_notices.py fails where a wheel carries an unknown one.
+here, since most wheels do not state them. tests/house/test_notices.py fails where a wheel carries an unknown one.
 """
 
 from __future__ import annotations

@@ -22,6 +22,7 @@ from pipeline.errors import BuildingError
 from pipeline.methods import ReconstructSettings, method_named
 from pipeline.model import BuildingResult, Candidate, Decision, PreparedCloud, Reason, Segmentation, Status
 from pipeline.prepared_cloud import prepare_cloud
+from pipeline.registry import extra
 from pipeline.roof.forms import FaceForm, arranged_forms, template_forms, undrawable
 from pipeline.roof.named_form import PRIMITIVE, NamedForm
 from pipeline.roof.plan import RoofPlan, RoofPoints, partition_roof, roof_points
@@ -68,9 +69,7 @@ def reconstruct_building(candidate: Candidate, method: str, settings: Reconstruc
         fault = undrawable("guides", RuntimeError(result.reason_detail))
         return dataclasses.replace(without_guides, decisions=(fault, *without_guides.decisions))
     if result.status is Status.FAILED and result.reason is not Reason.INTERNAL_ERROR and candidate.given is not None:
-        from pipeline.building.given_model import given_model
-
-        result = given_model(candidate, method, settings, decisions, result)
+        result = extra("given_model")(candidate, method, settings, decisions, result)
     return result if result.solids else dataclasses.replace(result, decisions=tuple(decisions))
 
 
@@ -97,16 +96,12 @@ def _reconstruct(
                 raise lack
             forms: Iterator[FaceForm] = template_forms(roof, lack, settings.roof)
         elif segmentation.faces is not None:
-            from pipeline.roof.primitives import primitive_partition
-
-            forms = iter([NamedForm(PRIMITIVE, partial(primitive_partition, segmentation.faces))])
+            forms = iter([NamedForm(PRIMITIVE, partial(extra("primitive_partition"), segmentation.faces))])
         elif is_arranged:
             roof = with_shaded_points(roof, cloud, segmentation.planes)
             if roof.footprint_mm is not None:
-                from pipeline.roof.unseen_slopes import with_unseen_slopes
-
                 elsewhere = building.candidate.elsewhere
-                roof, planes = with_unseen_slopes(roof, segmentation.planes, elsewhere, settings.roof)
+                roof, planes = extra("with_unseen_slopes")(roof, segmentation.planes, elsewhere, settings.roof)
                 segmentation = dataclasses.replace(segmentation, planes=planes)
             forms = arranged_forms(roof, segmentation.planes, settings.roof, settings.plan, building.decisions)
         else:

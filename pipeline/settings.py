@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import itertools
 import json
 from collections.abc import Mapping
 from typing import Any
 
 from pipeline.errors import SettingsError
-from pipeline.methods import LODS, METHODS, OVERHANGS, PRESETS, ReconstructSettings, method_named
+from pipeline.methods import METHODS, ReconstructSettings, method_named
+from pipeline.options import ChosenSettings
 from pipeline.parameters import Parameters, build, parameter, read_toml
 from pipeline.quality.settings import SupportSettings
 from pipeline.roof.settings import ArrangementSettings, FootprintSettings, GuideSettings, RoofSettings, RoofTypeSettings
@@ -27,36 +27,9 @@ from pipeline.terrain.settings import (
 )
 
 
-class GeneralSettings(Parameters):
+class GeneralSettings(ChosenSettings):
     """Settings of the run as a whole."""
 
-    method: str = parameter("arrangement", "The method that models the buildings.", choices=tuple(METHODS))
-    preset: str = parameter(
-        "robust",
-        "Defaults of the method's settings: those that measured better, or those of its paper.",
-        choices=PRESETS,
-        changes_geometry=False,
-    )
-    lods: str = parameter(
-        LODS[-1],
-        "Levels of detail of the models; records describe the finest up to 2.2, which 2.3 brings with it.",
-        choices=tuple(
-            ",".join(chosen)
-            for n in range(1, len(LODS) + 2)
-            for chosen in itertools.combinations((*LODS, OVERHANGS), n)
-        ),
-    )
-    classes: str = parameter(
-        "trust",
-        "Use of the classes in the file: trusted, only compared with the result, or ignored.",
-        choices=("trust", "audit", "ignore"),
-    )
-    terrain: str = parameter(
-        "none",
-        "Terrain that is written beside the buildings: none, or triangles with their outlines cut out.",
-        choices=("none", "tin"),
-        changes_geometry=False,
-    )
     terrain_tolerance_m: float = parameter(
         0.1,
         "How far the triangles of the terrain may be above or below the middle of a cell of the ground.",

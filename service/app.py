@@ -13,7 +13,7 @@ from pipeline import __version__
 from service import openapi, problems
 from service.arrivals import Arrivals
 from service.compression import Compressed
-from service.features.runs import published_runs
+from service.features.runs import check_published, published_runs
 from service.files import StateFolder
 from service.guard import Guard
 from service.input_policy import check_hosts, check_roots
@@ -29,7 +29,6 @@ from service.routes import (
     jobs,
     landing,
     log,
-    points,
     processes,
     published,
     results,
@@ -58,7 +57,6 @@ ROUTERS: tuple[APIRouter, ...] = (
     webhooks.router,
     results.router,
     buildings.router,
-    points.router,
     published.router,
     collections.router,
     health.router,
@@ -144,8 +142,6 @@ def start(settings: ServiceSettings, store: JobStore) -> None:
     check_roots(settings)
     StateFolder(settings.state).prepare()
     if settings.publish:
-        from service.features.tables import check_published  # loads Arrow
-
         check_published(published_runs(settings.publish, settings.state))
     store.migrate()
     store.fill_ballast(settings.reserve_bytes)

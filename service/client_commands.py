@@ -8,28 +8,14 @@ import json
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pipeline.cli.options import (
-    AllowOutside,
-    AsJson,
-    Bbox,
-    Classes,
-    Crs,
-    Footprints,
-    Layer,
-    Licence,
-    Lods,
-    Method,
-    Quiet,
-    SettingsFile,
-    VerticalUnit,
-    WithPoints,
-)
+from pipeline.cli.options import AsJson, Quiet, SettingsFile, set_parameters, takes_options
 from pipeline.console import Console, ExitCode, exit_code_of
 from pipeline.errors import SettingsError
+from pipeline.options import served
 
 if TYPE_CHECKING:
     from service.client import Client, Event, Job, Transfer
@@ -147,9 +133,7 @@ def _of_service(command: Callable[..., None]) -> Callable[..., None]:
 
     own = list(inspect.signature(command, eval_str=True).parameters.values())[1:]
     shared = list(inspect.signature(called, eval_str=True).parameters.values())[:-1]
-    parameters = [one.replace(kind=inspect.Parameter.KEYWORD_ONLY) for one in (*own, *shared)]
-    called.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined] # what typer reads
-    called.__annotations__ = {one.name: one.annotation for one in parameters}
+    set_parameters(called, [*own, *shared])
     called.__name__, called.__doc__ = command.__name__, command.__doc__
     return called
 
@@ -158,6 +142,7 @@ def _of_service(command: Callable[..., None]) -> Callable[..., None]:
 
 
 @_of_service
+@takes_options("submit", meshes=None)
 def submit(
     remote: Remote,
     tiles: Annotated[
@@ -167,32 +152,11 @@ def submit(
         str | None,
         typer.Option(metavar="NAME", help="reconstruct (default), compare (default with --methods) or classify."),
     ] = None,
-    footprints: Footprints = None,
-    layer: Layer = None,
-    guides: Annotated[
-        str | None, typer.Option(metavar="FILE", help="Lines of roofs (GeoPackage, GeoJSON, GeoParquet) to follow.")
-    ] = None,
-    crs: Crs = None,
-    vertical_unit: VerticalUnit = None,
-    allow_outside_area_of_use: AllowOutside = False,
-    bbox: Bbox = None,
-    classes: Classes = None,
-    method: Method = None,
-    preset: Annotated[
-        Literal["robust", "faithful"] | None,
-        typer.Option(help="Settings of the method that measured better, or that keep to its paper."),
-    ] = None,
     methods: Annotated[
         str | None,
         typer.Option(metavar="M1,M2,…", help="Compare these methods, each METHOD or METHOD:PRESET, instead of one."),
     ] = None,
-    lods: Lods = None,
     settings: SettingsFile = None,
-    meshes: Annotated[
-        Literal["building", "tile", "glb", "none"] | None,
-        typer.Option(help="One OBJ per building (default), one OBJ per tile, one GLB per tile, or none."),
-    ] = None,
-    points: WithPoints = False,
     formats: Annotated[
         list[str] | None,
         typer.Option(
@@ -212,7 +176,6 @@ def submit(
         list[str] | None,
         typer.Option("--output", metavar="NAME", help="Only this output; repeat --output for several. Default: all."),
     ] = None,
-    licence: Licence = None,
     title: Annotated[str | None, typer.Option(metavar="TEXT", help="Your own title for the job.")] = None,
     priority: Annotated[
         int | None, typer.Option(metavar="N", min=-10, max=10, help="Higher runs first; above 0 needs an admin key.")
@@ -224,25 +187,15 @@ def submit(
         bool, typer.Option("--new", help="Make another job, even if the same command has made one within a day.")
     ] = False,
     wait: Annotated[bool, typer.Option("--wait", help="Watch the job to its end, like `gablework watch`.")] = False,
+    **given: Any,
 ) -> None:
     """Send tiles to a service and start a job. Run it again to continue after an interruption."""
     inputs = {
-        "footprintsLayer": layer,
-        "crs": crs,
-        "verticalUnit": vertical_unit,
-        "allowOutsideAreaOfUse": allow_outside_area_of_use or None,
-        "bbox": None if bbox is None else list(bbox),
-        "classes": classes,
-        "method": method,
-        "preset": preset,
+        **{one.input: given[one.name] or None for one in served()},
         "methods": None if methods is None else [word.strip() for word in methods.split(",") if word.strip()],
-        "lods": lods,
-        "meshes": meshes,
-        "points": points or None,
         "publish": list(formats or ()) or None,
         "geoidHeight": geoid_height,
         "rasterCell": raster_cell,
-        "licence": licence,
         "title": title,
         "priority": priority,
         "subscriber": None if subscriber is None else _document(subscriber, "--subscriber"),
@@ -251,8 +204,8 @@ def submit(
         tiles,
         process=process or ("reconstruct" if methods is None else "compare"),
         inputs=inputs | {"settings": None if settings is None else _settings(settings)},
-        footprints=footprints,
-        guides=guides,
+        footprints=given["footprints"],
+        guides=given["guides"],
         outputs=outputs or None,
         new=new,
         on_transfer=_shown(remote.console, "upload"),

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pipeline.cli.options import AsJson, TlsCa, TlsCert, TlsKey, count_or_auto
+from pipeline.cli.options import AsJson, count_or_auto, takes_options
 from pipeline.console import Console
 from pipeline.errors import RunError, SettingsError
 
@@ -37,9 +37,6 @@ ServiceWorkers = Annotated[
         parser=functools.partial(count_or_auto, least=1),
         help="Processes of the embedded cluster, auto for one per core; default GABLEWORK_WORKERS.",
     ),
-]
-Scheduler = Annotated[
-    str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler to use instead of the embedded cluster.")
 ]
 
 KeyId = Annotated[str, typer.Argument(metavar="ID", help="Id of the key, as in `gablework keys list`.")]
@@ -106,6 +103,7 @@ def _log_to_stderr() -> None:
         logging.getLogger(chatty).setLevel(logging.ERROR)
 
 
+@takes_options("serve")
 def serve(
     host: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="Address to listen on; all except loopback need keys.")
@@ -116,10 +114,6 @@ def serve(
     state: State = None,
     database_url: DatabaseUrl = None,
     workers: ServiceWorkers = None,
-    scheduler: Scheduler = None,
-    tls_ca: TlsCa = None,
-    tls_cert: TlsCert = None,
-    tls_key: TlsKey = None,
     driver: Annotated[
         bool, typer.Option("--driver/--no-driver", help="Run a driver here, or leave jobs to drivers elsewhere.")
     ] = True,
@@ -137,6 +131,7 @@ def serve(
         typer.Option(metavar="[NAME=]RUN", help="Serve a finished run, a folder or URL, as features; repeatable."),
     ] = None,
     as_json: AsJson = False,
+    **given: Any,
 ) -> None:
     """Serve the REST API and the web page, with a job driver and a cluster."""
     with Console(as_json=as_json) as console, _service_errors():
@@ -149,14 +144,11 @@ def serve(
             state=state,
             database_url=database_url,
             workers=workers,
-            scheduler=scheduler,
-            tls_ca=tls_ca,
-            tls_cert=tls_cert,
-            tls_key=tls_key,
             public_url=public_url,
             input_roots=input_root,
             input_hosts=input_host,
             publish=publish,
+            **given,
         )
 
         if driver:
@@ -170,20 +162,18 @@ def serve(
         serve_until_stopped(settings, on_ready, with_driver=driver)
 
 
+@takes_options("driver")
 def drive(
     state: State = None,
     database_url: DatabaseUrl = None,
     workers: ServiceWorkers = None,
-    scheduler: Scheduler = None,
-    tls_ca: TlsCa = None,
-    tls_cert: TlsCert = None,
-    tls_key: TlsKey = None,
     name: Annotated[
         str | None, typer.Option(metavar="NAME", help="Name in logs and leases; default host and process.")
     ] = None,
     with_parent: Annotated[
         bool, typer.Option("--with-parent", help="End when standard input closes; set by `gablework serve`.")
     ] = False,
+    **given: Any,
 ) -> None:
     """Run the jobs of a service: the driver alone, for an API that runs elsewhere."""
     with Console(), _service_errors():
@@ -191,15 +181,7 @@ def drive(
         from service.files import StateFolder
 
         _log_to_stderr()
-        settings = _settings(
-            state=state,
-            database_url=database_url,
-            workers=workers,
-            scheduler=scheduler,
-            tls_ca=tls_ca,
-            tls_cert=tls_cert,
-            tls_key=tls_key,
-        )
+        settings = _settings(state=state, database_url=database_url, workers=workers, **given)
         StateFolder(settings.state).prepare()
         if with_parent:
             os.nice(_NICENESS)

@@ -23,6 +23,8 @@ from collections.abc import Mapping
 from enum import StrEnum
 from typing import Any, Literal
 
+from pipeline.options import ModelOptions
+
 
 class JobStatus(StrEnum):
     """Status of a job, in the words of OGC API - Processes."""
@@ -99,7 +101,7 @@ class Subscriber:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class JobRequest:
+class JobRequest(ModelOptions):
     """The job's request, validated at submission."""
 
     process_id: str = "reconstruct"
@@ -108,18 +110,8 @@ class JobRequest:
     """Point clouds."""
     footprints: InputReference | None = None
     """A vector file of building outlines."""
-    footprints_layer: str | None = None
-    """Their layer, where the file has several."""
     guides: InputReference | None = None
     """A vector file of lines of roofs; not for `classify`."""
-    crs: str | None = None
-    """Overrides the CRS in the headers."""
-    vertical_unit: str | None = None
-    """Overrides the vertical unit in the headers."""
-    allow_outside_area_of_use: bool = False
-    """Accept tiles that lie far outside the area of use of their CRS."""
-    bbox: tuple[float, float, float, float] | None = None
-    """x_min, y_min, x_max, y_max in the CRS's units."""
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """Settings that differ from the defaults, as in a settings file; includes `method`, `preset` and `classes`."""
     methods: tuple[str, ...] = ()
@@ -128,16 +120,10 @@ class JobRequest:
     """Message and delay in seconds; only for `echo`, which has no tiles."""
     raster_cell: float | None = None
     """Side of the cells of rasters in the CRS's units; None for the default. Only for `classify`."""
-    meshes: str = "building"
-    """building or tile: one OBJ file for each; glb: one GLB file per tile; or none."""
-    points: bool = False
-    """Whether the points are delivered, too, as 3D Tiles. Only for `reconstruct`."""
     publish: tuple[str, ...] = ()
     """Further formats of the results, words of `service.outputs.kinds.FORMATS`. Only for `reconstruct`."""
     geoid_height: float | None = None
     """Metres of the geoid above the ellipsoid, added to the elevations of 3D Tiles."""
-    licence: str | None = None
-    """Licence of the source data."""
     outputs: tuple[str, ...] | None = None
     """Ids of the wanted outputs; None for all."""
     response: str = "document"

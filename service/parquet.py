@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import EmptyInputError, UnreadableInputError
-from pipeline.io.geoparquet import DEPTHS, geometry_column
+from pipeline.extras.vector_files.geoparquet_layer import DEPTHS, geometry_column
 from pipeline.io.library_faults import in_our_words
 from service.errors import TooLargeError
 from service.input_policy import checked_crs

@@ -192,7 +192,7 @@ def _count_before_reading(path: Path, name: str) -> int:
 
         return read_header_block(path).point_count
     if name == "ply":
-        from pipeline.io.ply import promised_vertices
+        from pipeline.extras.ply_ascii.ply import promised_vertices
 
         return promised_vertices(path)
     lines = 1

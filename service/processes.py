@@ -51,7 +51,7 @@ class Process:
             **dict(self.summary(base)),
             inputs=self._inputs(settings.max_inputs),
             outputs={
-                name: OutputDescription(title=kind.title, description=kind.description, schema=dict(kind.schema))
+                name: OutputDescription(title=kind.title, description=kind.description, schema=kind.schema)
                 for name, kind in kinds
             },
         )

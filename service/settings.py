@@ -212,18 +212,12 @@ class ServiceSettings(BaseSettings):
         default=30.0,
         gt=0.0,
         le=36_500.0,
-        description="Days after which a finished delivery is removed from the log, and the end of a job that a paused "
-        "webhook did not get.",
+        description="Days after which a finished delivery is removed from the log.",
     )
     webhook_log_max: int = Field(
         default=20_000,
         gt=0,
         description="Maximum number of finished deliveries in the log, and of failed ones; the oldest are removed.",
-    )
-    webhook_max_waiting: int = Field(
-        default=200,
-        gt=0,
-        description="Maximum number of messages that wait for a webhook which does not keep up; then it is paused.",
     )
 
     # the web page

@@ -8,6 +8,7 @@ from urllib.parse import quote
 
 from starlette.responses import Response
 
+from pipeline.options import served
 from service.jobs import InputReference, Job, JobEvent, JobRequest, JobStatus, Subscriber
 from service.outputs import KINDS, Catalogue
 from service.problems import failure_document
@@ -101,20 +102,13 @@ def execute_request(request: JobRequest, base: str, priority: int) -> Execute:
         **(request.echo or {}),
         "tiles": [reference(tile) for tile in request.tiles] or None,
         "footprints": None if request.footprints is None else reference(request.footprints),
-        "footprintsLayer": request.footprints_layer,
         "guides": None if request.guides is None else reference(request.guides),
-        "crs": request.crs,
-        "verticalUnit": request.vertical_unit,
-        "allowOutsideAreaOfUse": request.allow_outside_area_of_use or None,
-        "bbox": None if request.bbox is None else list(request.bbox),
+        **{one.input: _sent(getattr(request, one.name)) for one in served(request.process_id) if not one.is_setting},
         "methods": list(request.methods) or None,
         "settings": dict(request.settings) or None,
         "rasterCell": request.raster_cell,
-        "meshes": request.meshes if request.has_buildings else None,
-        "points": request.points or None,
         "publish": list(request.publish) or None,
         "geoidHeight": request.geoid_height,
-        "licence": request.licence,
         "title": request.title,
         "priority": priority or None,
     }
@@ -124,6 +118,11 @@ def execute_request(request: JobRequest, base: str, priority: int) -> Execute:
         response="raw" if request.response == "raw" else "document",
         subscriber=None if request.subscriber is None else _uris(request.subscriber),
     )
+
+
+def _sent(value: Any) -> Any:
+    """The value of an option as an input; None for a permission that is not given."""
+    return list(value) if isinstance(value, tuple) else value or None
 
 
 def _uris(subscriber: Subscriber) -> SubscriberUris:

@@ -21,9 +21,7 @@ from urllib.parse import quote
 import numpy as np
 
 from pipeline.errors import EmptyInputError, InputError, UnreadableInputError
-from pipeline.io.crs_given import parse_crs
-from pipeline.io.formats import ARCHIVE_SUFFIXES, GEOJSON_SUFFIXES, LINES_SUFFIXES, PARQUET_SUFFIXES, XML_SUFFIXES
-from pipeline.io.gdal_source import (
+from pipeline.extras.vector_files.gdal_source import (
     FLATGEOBUF_MAGIC,
     RECORD,
     SHAPE_MAGIC,
@@ -32,9 +30,11 @@ from pipeline.io.gdal_source import (
     refuse_unread,
     xml_ending,
 )
+from pipeline.extras.vector_files.nearby import POLYGONS as SHAPE_OF_FOOTPRINTS
+from pipeline.extras.vector_files.vector_archive import ZIP_MAGIC, refuse_without_vectors, unpacked, vector_members
+from pipeline.io.crs_given import parse_crs
+from pipeline.io.formats import ARCHIVE_SUFFIXES, GEOJSON_SUFFIXES, LINES_SUFFIXES, PARQUET_SUFFIXES, XML_SUFFIXES
 from pipeline.io.library_faults import in_our_words, shortened
-from pipeline.io.nearby import POLYGONS as SHAPE_OF_FOOTPRINTS
-from pipeline.io.vector_archive import ZIP_MAGIC, refuse_without_vectors, unpacked, vector_members
 from service.errors import TooLargeError
 
 GEOPACKAGE_LIMIT = 2**30

@@ -13,8 +13,8 @@ No SQL, no HTTP; time is an argument.
         +----------> dropped
 ```
 
-Each event is a row that is written in the transaction that changes the job, so no change goes unreported. A delivery
-per receiver comes with it, or later where too many of that receiver wait. A replay makes any of them wait again.
+Each event is a row that is written with a delivery per receiver in the transaction that changes the job, so no change
+goes unreported. A replay makes a delivery wait again.
 Signatures follow Standard Webhooks (standardwebhooks.com).
 """
 
@@ -43,17 +43,8 @@ PROGRESS_S = 10.0
 LONGEST_PAUSE_S = 4.0 * 3600.0
 """Longest pause between two attempts: a receiver that comes back after a night gets its news within the morning."""
 
-ROOM = 24
-"""Most deliveries of one endpoint that wait in rows of their own. Others wait as events, which all endpoints share."""
-
-KEEPS_UP_S = 30.0
-"""An endpoint keeps up if no delivery waits longer in line. Others may be paused: a burst pauses no quick one."""
-
-UNDER_WAY = dt.timedelta(minutes=1)
-"""Longest time from an event to the commit of its row: longer than a transaction waits and works."""
-
-MAX_SUBSCRIBED = 2000
-"""Most deliveries to subscribers of one key that wait. Ends of jobs beyond it fail at once and can be replayed."""
+MAX_WAITING = 2000
+"""Most deliveries that wait for one endpoint, or for the subscribers of one key: further ends of jobs fail at once."""
 
 GONE = 410
 """The status by which a receiver ends its deliveries."""
@@ -161,10 +152,6 @@ class Endpoint:
     updated_at: dt.datetime
     owner: str | None = None
     """The key that made it; None if keys are not used."""
-    paused_at: dt.datetime | None = None
-    """Time since which nothing is sent because too much waited; None if it is not paused."""
-    not_sent: int = 0
-    """Number of messages that wait for room or, if it is paused, for a replay."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -230,9 +217,6 @@ class Parcel:
     """Signs it."""
     sent_at: dt.datetime
     """The time of this attempt."""
-    event_id: str | None = None
-    """The event; None for a delivery of an earlier version."""
-
     payer: str = ""
     """The key that made the endpoint or the job: it holds a share of the senders. Empty if keys are not used."""
 

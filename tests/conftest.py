@@ -27,7 +27,6 @@ pytest.register_assert_rewrite(
     "schedule_contract",
     "schedule_store_contract",
     "store_contract",
-    "webhook_backlog_contract",
     "webhook_store_contract",
 )
 
@@ -47,36 +46,36 @@ REQUIRED_PROGRAMS = "GABLEWORK_REQUIRE_PROGRAMS"
 """Environment variable of .ci/run: 1 makes a test that needs PostgreSQL or Chromium fail where it would skip."""
 
 LONGEST_FIRST = (
-    "84_web",
-    "82_cluster/test_batch_faults.py",
-    "82_cluster/test_faults.py",
-    "03_compiler/test_wheel.py",
-    "82_cluster/test_batch_store_faults.py",
-    "82_cluster/test_workers.py",
-    "81_driver/test_driver_processes.py",
-    "83_openapi/test_schemathesis.py",
-    "82_cluster/test_tls_cluster.py",
-    "55_runtime/test_work.py",
-    "55_runtime/test_overrides.py",
-    "55_runtime/test_tile_independence.py",
-    "55_runtime/test_object_store_runs.py",
-    "90_benchmarks/test_city_scale.py",
-    "90_benchmarks/test_entries.py",
-    "55_runtime/test_isolation.py",
-    "55_runtime/test_classify.py",
-    "15_simulation/test_solids.py",
-    "81_postgres/test_schedules.py",
-    "81_postgres/test_store.py",
-    "65_report/test_evaluation_page.py",
-    "45_roof/test_arrangement_parts.py",
-    "80_service/test_buildings_api.py",
-    "60_export/test_tile_update.py",
-    "55_runtime/test_replay.py",
-    "55_runtime/test_run.py",
+    "service/viewer",
+    "pipeline/runtime/cluster/test_batch_faults.py",
+    "pipeline/runtime/cluster/test_faults.py",
+    "pipeline/compiler/test_wheel.py",
+    "pipeline/runtime/cluster/test_batch_store_faults.py",
+    "pipeline/runtime/cluster/test_workers.py",
+    "service/driver/test_driver_processes.py",
+    "service/openapi/test_schemathesis.py",
+    "pipeline/runtime/cluster/test_tls_cluster.py",
+    "pipeline/runtime/test_work.py",
+    "pipeline/runtime/test_overrides.py",
+    "pipeline/runtime/test_tile_independence.py",
+    "pipeline/runtime/test_object_store_runs.py",
+    "benchmarks/test_city_scale.py",
+    "benchmarks/test_entries.py",
+    "pipeline/runtime/test_isolation.py",
+    "pipeline/runtime/test_classify.py",
+    "pipeline/ruler/simulation/test_solids.py",
+    "service/postgres/test_schedules.py",
+    "service/postgres/test_store.py",
+    "pipeline/report/test_evaluation_page.py",
+    "pipeline/roof/test_arrangement_parts.py",
+    "service/test_buildings_api.py",
+    "pipeline/export/test_tile_update.py",
+    "pipeline/runtime/test_replay.py",
+    "pipeline/runtime/test_run.py",
 )
 """Tests that take longest. They begin first, so that no process works on one of them alone at the end."""
 
-TOGETHER = ("tests/84_web",)
+TOGETHER = ("tests/service/viewer",)
 """Folders whose tests share one process: a browser without a graphics card leaves little time for a second one."""
 
 
@@ -205,7 +204,7 @@ def bucket(s3: FaultyProxy) -> str:
     """The URL of a bucket of its own."""
     from uuid import uuid4
 
-    from pipeline.io.urls import filesystem_of
+    from pipeline.extras.remote.urls import filesystem_of
 
     url = f"s3://tests-{uuid4().hex[:12]}"
     filesystem_of(url).mkdir(url)

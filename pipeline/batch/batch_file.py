@@ -22,11 +22,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import SettingsError
-from pipeline.export.folders import MESHES
-from pipeline.io.reading import INPUT_TIMEOUT_S
+from pipeline.options import AUTO, ModelFiles, ModelOptions, Option, all_options, values_of
 from pipeline.parameters import Parameters, build, is_finite_number, parameter, quoted, read_toml
-from pipeline.runtime.cluster.tls import given_tls
-from pipeline.runtime.isolation.limits import IsolationLimits
 from pipeline.schedule import Cron, Missed, Overlap, Rules
 from pipeline.settings import RunSettings
 
@@ -34,85 +31,21 @@ if TYPE_CHECKING:
     from pipeline.runtime.request import RunRequest
 
 
-class InputsTable(Parameters):
-    """`[inputs]`: data to read."""
-
-    crs: str = parameter("", "CRS of the inputs, if their header has none or a wrong one.")
-    vertical_unit: str = parameter("", "Unit of elevations: m, ft or us-ft; empty takes it from the header.")
-    allow_outside_area_of_use: bool = parameter(
-        False, "Accept inputs that lie far outside the area of use of their CRS."
-    )
-    footprints: str = parameter("", "Building outlines to model; empty finds the buildings in the points.")
-    footprints_layer: str = parameter("", "Layer of the outlines, where their file has several.")
-    guides: str = parameter("", "Lines of roofs that models follow.")
-    overrides: str = parameter("", "File with manual overrides for single buildings.")
-    aoi: str = parameter("", "Vector file with polygons; only points inside them are used.")
-    licence: str = parameter("", "Licence of the source data, written into the results.")
-
-
-class OutputTable(Parameters):
-    """`[output]`: files to write."""
-
-    path: str = parameter("", "The run directory.")
-    meshes: str = parameter(
-        "building", "One OBJ per building, one OBJ per tile, one GLB per tile, or none.", choices=MESHES
-    )
-    points: bool = parameter(False, "Also write the points as 3D Tiles, with their distances to the models.")
-    overwrite: bool = parameter(False, "Replace an existing run that does not belong to this batch.")
-    report: bool = parameter(True, "Write run.html, the page about the run, when it is over.")
-
-
-class WorkTable(Parameters):
-    """`[work]`: intermediate results."""
-
-    path: str = parameter(
-        "",
-        "The work folder, on a file system that all workers share; empty takes the batch file's name with the ending "
-        ".work.",
+def _table(name: str, doc: str, **own: Any) -> type[Parameters]:
+    """The settings class of a table: its own keys, and the options of a run that are there."""
+    keys = own | {one.name: _key(one) for one in all_options() if one.meta["table"] == name and one.name != "bbox"}
+    return type(
+        name, (Parameters,), {"__doc__": f"`[{name}]`: {doc}", "__annotations__": dict.fromkeys(keys, Any), **keys}
     )
 
 
-class ClusterTable(Parameters):
-    """`[cluster]`: processes that do the work."""
-
-    workers: int | str = parameter(
-        "auto",
-        "Processes of the embedded cluster; 0 runs serially in the driver, auto starts a cluster for large runs only.",
-        minimum=0,
-        maximum=1024,
-    )
-    scheduler: str = parameter(
-        "", "A Dask scheduler to use in place of the embedded cluster; not together with workers."
-    )
-    tls_ca: str = parameter("", "Certificate of the CA of all the cluster's processes, PEM; with tls_cert.")
-    tls_cert: str = parameter("", "The driver's certificate, PEM.")
-    tls_key: str = parameter("", "The driver's private key, PEM; empty if the certificate file has it, too.")
-    performance_report: str = parameter("", "HTML page about the time of the workers; empty writes none.")
-    metrics_port: int = parameter(
-        0, "Port of 127.0.0.1 for the run's figures in the format of Prometheus; 0 for none.", minimum=0, maximum=65535
-    )
-    isolate: bool = parameter(True, "Model buildings in supervised child processes: a bad building costs only itself.")
-    input_timeout_s: float = parameter(
-        INPUT_TIMEOUT_S,
-        "Most seconds within which some more of an input must be read.",
-        unit="s",
-        minimum=1.0,
-        maximum=86_400.0,
-    )
-    building_timeout_s: float = parameter(
-        IsolationLimits.timeout_s,
-        "Most seconds per building in its child process.",
-        unit="s",
-        minimum=1.0,
-        maximum=86_400.0,
-    )
-    building_memory_gib: float = parameter(
-        IsolationLimits.memory_bytes / 2**30,
-        "Most memory of the child process of a building.",
-        unit="GiB",
-        minimum=0.5,
-        maximum=4096.0,
-    )
+def _key(option: Option) -> Any:
+    """An option as a key, where a text without a value is empty."""
+    default = option.default
+    if default is None:
+        default = {str: "", int: AUTO, bool: True}[option.type]
+    limits = {name: option.meta[name] for name in ("unit", "minimum", "maximum", "choices")}
+    return parameter(default, option.meta["doc"], **limits)
 
 
 class ScheduleTable(Parameters):
@@ -152,10 +85,33 @@ class ScheduleTable(Parameters):
 
 
 TABLES: Mapping[str, type[Parameters]] = {
-    "inputs": InputsTable,
-    "output": OutputTable,
-    "work": WorkTable,
-    "cluster": ClusterTable,
+    "inputs": _table("inputs", "data to read."),
+    "output": _table(
+        "output",
+        "files to write.",
+        path=parameter("", "The run directory."),
+        overwrite=parameter(False, "Replace an existing run that does not belong to this batch."),
+        report=parameter(True, "Write run.html, the page about the run, when it is over."),
+    ),
+    "work": _table(
+        "work",
+        "intermediate results.",
+        path=parameter(
+            "",
+            "The work folder, on a file system that all workers share; empty takes the batch file's name with the "
+            "ending .work.",
+        ),
+    ),
+    "cluster": _table(
+        "cluster",
+        "processes that do the work.",
+        metrics_port=parameter(
+            0,
+            "Port of 127.0.0.1 for the run's figures in the format of Prometheus; 0 for none.",
+            minimum=0,
+            maximum=65535,
+        ),
+    ),
     "schedule": ScheduleTable,
 }
 """Tables of a batch file beside `[settings]`."""
@@ -167,17 +123,17 @@ class Batch:
 
     path: Path
     """The file."""
-    inputs: InputsTable
+    inputs: Any
     """Table `[inputs]`, without paths and bbox."""
     paths: tuple[str, ...]
     """Files, folders or patterns, absolute."""
     bbox: tuple[float, float, float, float] | None
     """x_min, y_min, x_max, y_max in the CRS's units."""
-    output: OutputTable
+    output: Any
     """Table `[output]`."""
-    work: WorkTable
+    work: Any
     """Table `[work]`."""
-    cluster: ClusterTable
+    cluster: Any
     """Table `[cluster]`."""
     schedule: ScheduleTable
     """Table `[schedule]`."""
@@ -203,44 +159,32 @@ class Batch:
         """Processes of the embedded cluster; None leaves it to the estimate."""
         return self.cluster.workers if isinstance(self.cluster.workers, int) else None
 
+    def given(self) -> dict[str, Any]:
+        """The options in the file by their names; None for those that are not given."""
+        found: dict[str, Any] = {"bbox": self.bbox}
+        for one in all_options():
+            if one.meta["table"] and one.name not in found:
+                value = getattr(getattr(self, one.meta["table"]), one.name)
+                if one.default is None and (value in ("", AUTO) or value is True):
+                    value = None
+                found[one.name] = self.whole(value) if one.is_path and value is not None else value
+        return found
+
     def request(self) -> RunRequest:
         """The request of a run."""
         # imported late: a status does not need it
         from pipeline.runtime.request import RunRequest
-        from pipeline.runtime.resources import Resources
+        from pipeline.runtime.resources import resources_of
 
-        def given(name: str) -> str | None:
-            return self.whole(name) if name else None
-
+        given = self.given()
         return RunRequest(
             inputs=self.paths,
             out=self.out,
             settings=self.settings,
-            footprints=given(self.inputs.footprints),
-            footprints_layer=self.inputs.footprints_layer or None,
-            guides=given(self.inputs.guides),
-            overrides=given(self.inputs.overrides),
-            crs=self.inputs.crs or None,
-            vertical_unit=self.inputs.vertical_unit or None,
-            allow_outside_area_of_use=self.inputs.allow_outside_area_of_use,
-            bbox=self.bbox,
-            aoi=given(self.inputs.aoi),
-            resources=Resources(
-                workers=self.workers,
-                scheduler=self.cluster.scheduler or None,
-                traffic="batch",
-                tls=given_tls(given(self.cluster.tls_ca), given(self.cluster.tls_cert), given(self.cluster.tls_key)),
-                performance_report=given(self.cluster.performance_report),
-                work=self.work_folder,
-                isolate=None if self.cluster.isolate else False,
-                input_timeout_s=self.cluster.input_timeout_s,
-                building_timeout_s=self.cluster.building_timeout_s,
-                building_memory_bytes=round(self.cluster.building_memory_gib * 2**30),
-            ),
-            meshes=self.output.meshes,
-            points=self.output.points,
-            licence=self.inputs.licence or None,
+            resources=resources_of(given, traffic="batch", work=self.work_folder),
             overwrite=self.output.overwrite,
+            **values_of(ModelFiles, given),
+            **values_of(ModelOptions, given),
         )
 
 

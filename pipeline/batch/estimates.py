@@ -18,6 +18,7 @@ from pipeline.batch.batch_file import Batch
 from pipeline.batch.keys import as_keys, errors_with_keys
 from pipeline.batch.remaining_time import duration
 from pipeline.errors import EmptyInputError, InputError, RunError
+from pipeline.extras.footprints.given_footprints import footprints_of_run
 from pipeline.io import shown
 from pipeline.runtime.cluster.dask_executor import memory_of_workers
 from pipeline.runtime.cluster.performance_report import PerformanceReport
@@ -32,7 +33,6 @@ from pipeline.runtime.resources import Resources
 from pipeline.runtime.run_directory import check_out
 from pipeline.runtime.scratch.folder import POINT
 from pipeline.runtime.scratch.work_folder import refuse_foreign
-from pipeline.runtime.stages.given_footprints import footprints_of_run
 from pipeline.tiling import MM
 
 # Constants of the estimate, measured; they decide nothing in a run, so they are not settings.

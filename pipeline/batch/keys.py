@@ -3,46 +3,27 @@
 from __future__ import annotations
 
 import contextlib
-import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 
 from pipeline.errors import GableworkError, InputError, SettingsError
+from pipeline.options import all_options
+from pipeline.renaming import Renaming
 
-KEYS: Mapping[str, str] = {
-    "--out": "[output] path",
-    "--overwrite": "[output] overwrite = true",
-    "--bbox": "[inputs] bbox",
-    "--aoi": "[inputs] aoi",
-    "--crs EPSG:n": '[inputs] crs = "EPSG:n"',
-    "--crs": "[inputs] crs",
-    "--vertical-unit": "[inputs] vertical_unit",
-    "--allow-outside-area-of-use": "[inputs] allow_outside_area_of_use = true",
-    "--footprints": "[inputs] footprints",
-    "--layer": "[inputs] footprints_layer",
-    "--guides": "[inputs] guides",
-    "--workers 1": "[cluster] workers = 1",
-    "--workers": "[cluster] workers",
-    "--tls-ca": "[cluster] tls_ca",
-    "--tls-cert": "[cluster] tls_cert",
-    "--tls-key": "[cluster] tls_key",
-    "--input-timeout": "[cluster] input_timeout_s",
-    "--building-timeout": "[cluster] building_timeout_s",
-    "--building-memory": "[cluster] building_memory_gib",
-}
-"""Keys by option. `--scheduler` is missing: the engine names it for workers, which have no batch file."""
-
-_OPTION = re.compile("|".join(rf"{re.escape(option)}(?![\w-])" for option in sorted(KEYS, key=len, reverse=True)))
-
-
-def as_keys(text: str) -> str:
-    """A message with keys in place of options.
-
-    >>> as_keys("a.laz is not empty: give another --out, or --overwrite")
-    'a.laz is not empty: give another [output] path, or [output] overwrite = true'
-    >>> as_keys("start it with --tls-ca-file")
-    'start it with --tls-ca-file'
-    """
-    return _OPTION.sub(lambda found: KEYS[found.group()], text)
+as_keys = Renaming(
+    (
+        (one, f"[{one.meta['table']}] {one.name}{' = true' if one.type is bool else ''}")
+        for one in all_options()
+        # the engine names the scheduler for workers, which have no batch file
+        if one.meta["table"] and one.name != "scheduler"
+    ),
+    {
+        "--out": "[output] path",
+        "--overwrite": "[output] overwrite = true",
+        "--crs EPSG:n": '[inputs] crs = "EPSG:n"',
+        "--workers 1": "[cluster] workers = 1",
+    },
+)
+"""A message with keys in place of options."""
 
 
 @contextlib.contextmanager

@@ -10,6 +10,7 @@ import numpy as np
 from pipeline.methods import ReconstructSettings
 from pipeline.model import Candidate, Decision, Doubt, Plane, RoofType, Segmentation
 from pipeline.quality.validity import check_solid
+from pipeline.registry import extra
 from pipeline.roof.forms import FaceForm
 from pipeline.roof.named_form import RankedFaces
 from pipeline.roof.partition import RoofPartition
@@ -64,12 +65,10 @@ def own_model(building: Building, segmentation: Segmentation, roof: RoofPoints, 
     elif drawn.planes is not None:
         planes = drawn.planes
     if segmentation.faces is not None:  # a primitive is one form: with a side made level it would be another
-        from pipeline.roof.flush_walls import unite_flush_walls
-
         parts = large_parts(solid_parts(drawn, list(planes), ground_z_m), settings.min_part_area_m2)
         return DrawnModel(
             lod="2.2",
-            parts=[unite_flush_walls(part) for part in parts],
+            parts=[extra("unite_flush_walls")(part) for part in parts],
             planes=list(planes),
             roof_type=segmentation.roof_type,
             bic_margin=margin,
@@ -80,9 +79,7 @@ def own_model(building: Building, segmentation: Segmentation, roof: RoofPoints, 
     def over(level: RoofPartition, extended: list[Plane]) -> DrawnModel:
         cut, cut_planes = cut_at_floor(level, extended, ground_z_m + settings.min_clearance_m)
         if (roof.index < 0).any():  # points were added on unseen sides
-            from pipeline.roof.unseen_slopes import with_support_of_seen
-
-            cut_planes = with_support_of_seen(cut, cut_planes, roof)
+            cut_planes = extra("with_support_of_seen")(cut, cut_planes, roof)
         contradiction = contradiction_of(cut, cut_planes, roof, slopes, segmentation.planes)
         all_parts = solid_parts(cut, cut_planes, ground_z_m)
         parts = large_parts(all_parts, settings.min_part_area_m2)

@@ -25,6 +25,7 @@ from pipeline.model import (
 )
 from pipeline.quality.model_quality import DRAWN_OUTLINE_SPACINGS, model_quality
 from pipeline.quality.validity import check_solid
+from pipeline.registry import extra
 from pipeline.roof.footprint import hull_of_points
 from pipeline.roof.plan import wall_outline, walls_of
 from pipeline.roof.roof_type import roof_type
@@ -51,10 +52,8 @@ def record_of(
     footprint = united([part.footprint for part in model.parts])
     guides = None
     if candidate.guides:
-        from pipeline.roof.guides import followed, guide_steps
-
-        with guide_steps():
-            guides = followed(candidate.guides, [face.polygon for face in faces], roof.guide_distance_m)
+        with extra("guide_steps")():
+            guides = extra("followed")(candidate.guides, [face.polygon for face in faces], roof.guide_distance_m)
     residuals, quality = model_quality(
         candidate.points,
         faces,
@@ -68,9 +67,7 @@ def record_of(
     walls = walls_of(footprint, roof, building.settings.roof)
     overhangs = None
     if OVERHANGS in building.settings.lods:
-        from pipeline.building.overhang_model import overhangs_of
-
-        overhangs = overhangs_of(building, model, walls)
+        overhangs = extra("overhangs_of")(building, model, walls)
     return BuildingResult(
         building_id=candidate.building_id,
         origin=candidate.origin,
@@ -111,9 +108,7 @@ def delivered(building: Building, model: DrawnModel) -> BuildingResult | None:
     settings, lods = building.settings, building.settings.record_lods
     if lods == (model.lod,):
         return record_of(building, model)
-    from pipeline.roof.lower_lods import lower_lods
-
-    models = lower_lods(
+    models = extra("lower_lods")(
         model, building.roof.points, building.candidate.ground_z_m, settings.roof, lods,
         lambda solid: not check_solid(solid),
     )  # fmt: skip

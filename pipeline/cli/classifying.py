@@ -3,36 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pipeline.cli.options import (
-    INPUT_TIMEOUT_S,
-    AllowOutside,
-    AsJson,
-    Classes,
-    Crs,
-    Footprints,
-    InputTimeout,
-    Layer,
-    Quiet,
-    Scheduler,
-    SettingsFile,
-    TlsCa,
-    TlsCert,
-    TlsKey,
-    VerticalUnit,
-    Workers,
-    tls_files,
-)
+from pipeline.cli.options import AsJson, Quiet, SettingsFile, takes_options
 from pipeline.console import Console
 from pipeline.runtime.isolation.preloading import is_surely_small, start_early
 
 if TYPE_CHECKING:
-    from pipeline.runtime.classify import ClassifySummary
+    from pipeline.extras.classify.classify import ClassifySummary
 
 
+@takes_options("classify")
 def classify(
     tiles: Annotated[
         list[str], typer.Argument(metavar="TILES", help="LAS, LAZ, COPC, PLY or ASCII files, or folders of them.")
@@ -45,50 +28,33 @@ def classify(
         float | None,
         typer.Option(metavar="SIDE", help="Side of the rasters' cells in the CRS's units; default 0.5 m or 2 ft."),
     ] = None,
-    footprints: Footprints = None,
-    layer: Layer = None,
-    crs: Crs = None,
-    vertical_unit: VerticalUnit = None,
-    allow_outside_area_of_use: AllowOutside = False,
-    classes: Classes = None,
     settings: SettingsFile = None,
-    workers: Workers = None,
-    scheduler: Scheduler = None,
-    tls_ca: TlsCa = None,
-    tls_cert: TlsCert = None,
-    tls_key: TlsKey = None,
-    input_timeout: InputTimeout = INPUT_TIMEOUT_S,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")] = False,
     as_json: AsJson = False,
     quiet: Quiet = False,
+    **given: Any,
 ) -> None:
     """Classify points as ground, building and vegetation, and write them back as LAZ."""
     with Console(as_json=as_json, quiet=quiet) as console:
-        from pipeline.runtime.classify import ClassifyRequest
-        from pipeline.runtime.classify import classify as classify_files
+        from pipeline.extras.classify.classify import ClassifyRequest
+        from pipeline.extras.classify.classify import classify as classify_files
+        from pipeline.options import InputFiles, InputOptions, chosen_settings, values_of
         from pipeline.runtime.compiling import RECONSTRUCT, compile_for
-        from pipeline.runtime.resources import Resources
+        from pipeline.runtime.resources import resources_of
         from pipeline.settings import RunSettings
 
         request = ClassifyRequest(
             inputs=tuple(tiles),
             out=out,
-            settings=RunSettings.from_toml(settings, {} if classes is None else {"classes": classes}),
-            footprints=footprints,
-            footprints_layer=layer,
-            crs=crs,
-            vertical_unit=vertical_unit,
-            allow_outside_area_of_use=allow_outside_area_of_use,
+            settings=RunSettings.from_toml(settings, chosen_settings(given)),
             rasters=rasters,
             raster_cell=raster_cell,
-            resources=Resources(
-                workers=workers,
-                scheduler=scheduler,
-                tls=tls_files(tls_ca, tls_cert, tls_key),
-                input_timeout_s=input_timeout,
-            ),
+            resources=resources_of(given),
             overwrite=overwrite,
+            **values_of(InputFiles, given),
+            **values_of(InputOptions, given),
         )
+        workers, scheduler, footprints = request.resources.workers, request.resources.scheduler, request.footprints
         compile_for(console.on_event, (*RECONSTRUCT, "classify"), tiles, (footprints,), scheduler=scheduler)
         if not is_surely_small(tiles):
             start_early(

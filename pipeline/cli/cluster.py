@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from pipeline.cli.options import LogJson, MetricsHost, MetricsPort, TlsCa, TlsCert, TlsKey
+from pipeline.cli.options import LogJson, MetricsHost, MetricsPort, takes_options
 from pipeline.console import Console
 
 
+@takes_options("worker")
 def worker(
     scheduler: Annotated[
         str, typer.Option(metavar="ADDRESS", help="The Dask scheduler, as tcp://host:8786 or tls://host:8786.")
@@ -31,19 +32,17 @@ def worker(
     give_up_after: Annotated[
         float | None, typer.Option(metavar="S", min=0, help="End when the scheduler was away so long; default never.")
     ] = None,
-    tls_ca: TlsCa = None,
-    tls_cert: TlsCert = None,
-    tls_key: TlsKey = None,
     metrics_port: MetricsPort = None,
     metrics_host: MetricsHost = "127.0.0.1",
     log_json: LogJson = False,
+    **given: Any,
 ) -> None:
     """Work for a Dask scheduler; on SIGTERM finish what runs, then leave."""
     with Console(log_json=log_json) as console:
-        from pipeline.runtime.cluster.tls import given_tls
         from pipeline.runtime.cluster.worker import WorkerOptions, serve_worker
         from pipeline.runtime.compiling import compile_first
         from pipeline.runtime.monitoring.logs import wants_json
+        from pipeline.runtime.resources import resources_of
 
         options = WorkerOptions(
             scheduler=scheduler,
@@ -54,7 +53,7 @@ def worker(
             host=host,
             drain_timeout_s=drain_timeout,
             give_up_after_s=give_up_after,
-            tls=given_tls(tls_ca, tls_cert, tls_key),
+            tls=resources_of(given).tls,
             log_json=log_json or wants_json(),
             metrics_port=metrics_port,
             metrics_host=metrics_host,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pipeline.cli.options import AsJson, AsSurveyed, Crs, Layer, Points, Quiet, SettingsFile, Truth, VerticalUnit
+from pipeline.cli.options import AsJson, AsSurveyed, Points, Quiet, SettingsFile, Truth, takes_options
 from pipeline.cli.summary import show_statistics
 from pipeline.console import Console
 from pipeline.errors import SettingsError
@@ -17,16 +17,16 @@ if TYPE_CHECKING:
     from pipeline.ruler.evaluation.evaluate import Evaluation
 
 
+@takes_options("inspect")
 def inspect(
     tile: Annotated[
         str,
         typer.Argument(metavar="TILE", help="A LAS, LAZ, COPC, PLY or ASCII file; or a run directory."),
     ],
-    crs: Crs = None,
-    vertical_unit: VerticalUnit = None,
     settings: SettingsFile = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
+    **given: Any,
 ) -> None:
     """Show the facts of a tile and an estimate of time and memory; or the figures and reasons of a run, added up."""
     with Console(as_json=as_json, quiet=quiet) as console:
@@ -37,10 +37,11 @@ def inspect(
         from pipeline.terrain.settings import ClassCodeSettings
 
         if _is_run(tile):
+            from pipeline.options import option_named
             from pipeline.report.statistics import run_statistics
 
-            given = {"--crs": crs, "--vertical-unit": vertical_unit, "--settings": settings}
-            unused = [f"{name} {value}" for name, value in given.items() if value is not None]
+            named = {"--settings": settings} | {option_named(name).flag: value for name, value in given.items()}
+            unused = [f"{flag} {value}" for flag, value in named.items() if value is not None]
             if unused:
                 raise SettingsError([f"{', '.join(unused)}: {tile} is a run, which has its own. Leave them out"])
             statistics = run_statistics(tile)
@@ -51,7 +52,7 @@ def inspect(
         def on_progress(done: int, total: int) -> None:
             console.on_event(Event(kind="progress", stage="read", done=done, total=total))
 
-        options = ReadOptions(crs=crs, vertical_unit=vertical_unit)
+        options = ReadOptions(**given)
         found = inspect_tile(tile, options, on_progress, RunSettings.from_toml(settings, {}))
         for warning in found.warnings:
             console.warn(warning)
@@ -101,6 +102,7 @@ def report(
         console.document({"run": run, "written": written})
 
 
+@takes_options("evaluate")
 def evaluate(
     models: Annotated[
         str, typer.Argument(metavar="MODELS", help="A run directory; CityJSON, CityJSONSeq or OBJ of any program.")
@@ -108,7 +110,6 @@ def evaluate(
     truth: Truth = None,
     points: Points = None,
     footprints: Annotated[str | None, typer.Option(metavar="FILE", help="Building outlines for the points.")] = None,
-    layer: Layer = None,
     ground: Annotated[
         list[str] | None,
         typer.Option(metavar="FILE", help="The same points, classified by another program: judge its ground."),
@@ -119,8 +120,6 @@ def evaluate(
             metavar="FILE", help="True roof edges in metres, as JSON or OBJ lines: judge edges and corners by them."
         ),
     ] = None,
-    crs: Crs = None,
-    vertical_unit: VerticalUnit = None,
     as_surveyed: AsSurveyed = False,
     blocks: Annotated[
         bool | None,
@@ -134,6 +133,7 @@ def evaluate(
     picture: Annotated[str | None, typer.Option(metavar="FILE", help="Draw the run to this PNG file.")] = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
+    **given: Any,
 ) -> None:
     """Measure models: against simulated truth, classified points, true roof edges, or alone."""
     with Console(as_json=as_json, quiet=quiet) as console:
@@ -145,13 +145,11 @@ def evaluate(
             truth=truth,
             points=tuple(points or ()),
             footprints=footprints,
-            footprints_layer=layer,
             ground=tuple(ground or ()),
             wireframes=wireframes,
-            crs=crs,
-            vertical_unit=vertical_unit,
             as_surveyed=as_surveyed,
             blocks=blocks,
+            **given,
         )
 
         def on_step(name: str) -> None:

@@ -1,29 +1,39 @@
-"""The options that several commands share."""
+"""The options that several commands share; those of runs are made from `pipeline.options`."""
 
 from __future__ import annotations
 
-import os
-from typing import TYPE_CHECKING, Annotated, Literal
+import inspect
+from collections.abc import Callable, Iterable
+from typing import Annotated, Any, Literal, TypeVar
 
 import typer
 
-if TYPE_CHECKING:
-    from pipeline.runtime.cluster.tls import TlsFiles
+from pipeline.options import AUTO, Option, all_options, served
+
+Command = TypeVar("Command", bound=Callable[..., None])
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON document; events as JSON lines on stderr.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="No progress; warnings and errors only.")]
-Crs = Annotated[
-    str | None, typer.Option(metavar="EPSG:n", help="The inputs' CRS, if their header has none or a wrong one.")
+SettingsFile = Annotated[str | None, typer.Option(metavar="FILE", help="Settings as TOML; docs/reference/settings.md.")]
+MetricsPort = Annotated[
+    int | None,
+    typer.Option(metavar="N", min=1, max=65535, help="Show metrics for Prometheus on this port, at /metrics."),
 ]
-VerticalUnit = Annotated[
-    str | None, typer.Option(metavar="UNIT", help="Unit of elevations: m, ft or us-ft; default from the header.")
+MetricsHost = Annotated[
+    str, typer.Option(metavar="ADDRESS", help="Address of these metrics: anyone who reaches it can read them.")
 ]
-AllowOutside = Annotated[
-    bool,
-    typer.Option("--allow-outside-area-of-use", help="Accept tiles that lie far outside the area of use of their CRS."),
+LogJson = Annotated[bool, typer.Option("--log-json", help="Log one JSON object per line, like GABLEWORK_LOG_JSON=1.")]
+Truth = Annotated[
+    str | None, typer.Option(metavar="DIR", help="The truth that simulate wrote: measure the models against it.")
 ]
-AUTO = "auto"
-"""The word for as many workers as the job needs and the machine has."""
+Points = Annotated[
+    list[str] | None,
+    typer.Option(metavar="TILE", help="A classified tile to measure against; repeat --points for several."),
+]
+AsSurveyed = Annotated[
+    bool, typer.Option("--as-surveyed", help="Move each true building by the shift of the strips that saw it.")
+]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing run.")]
 _MAX_WORKERS = 1024
 
 
@@ -48,137 +58,53 @@ def worker_count(text: str) -> int | None:
     return None if word == AUTO else int(word)
 
 
-Workers = Annotated[
-    int | None,
-    typer.Option(
-        metavar="N|auto",
-        parser=worker_count,
-        show_default=AUTO,
-        help="Processes of the embedded cluster; 0 runs serially in this process, auto starts a cluster for large "
-        "jobs only.",
-    ),
-]
-Method = Annotated[
-    str | None,
-    typer.Option(
-        metavar="METHOD",
-        help="arrangement, fuzzy-sart, parameter-space-2d, parameter-space-3d or kmeans; default from the settings.",
-    ),
-]
-Lods = Annotated[
-    str | None,
-    typer.Option(
-        metavar="L1,L2,…", help="Levels of detail to write: 1.2, 1.3, 2.2, 2.3, or several; default from the settings."
-    ),
-]
-Footprints = Annotated[
-    str | None,
-    typer.Option(
-        metavar="FILE",
-        help="Building outlines to model: GeoPackage, GeoJSON, Shapefile and others; docs/reference/formats.md.",
-    ),
-]
-Layer = Annotated[
-    str | None, typer.Option(metavar="NAME", help="Layer of the footprints, where their file has several.")
-]
-Guides = Annotated[
-    str | None,
-    typer.Option(metavar="FILE", help="Lines of roofs (ridges, eaves, ...) that models follow; docs/how_to/guides.md."),
-]
-Bbox = Annotated[
-    tuple[float, float, float, float] | None,
-    typer.Option(metavar="XMIN YMIN XMAX YMAX", help="Only this rectangle, in the CRS's units."),
-]
-Aoi = Annotated[str | None, typer.Option(metavar="FILE", help="Only the area inside the polygons of this vector file.")]
-Classes = Annotated[
-    Literal["trust", "audit", "ignore"] | None,
-    typer.Option(help="How to use the file's own classes; default from the settings."),
-]
-SettingsFile = Annotated[str | None, typer.Option(metavar="FILE", help="Settings as TOML; docs/reference/settings.md.")]
-Scheduler = Annotated[
-    str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler to use in place of the embedded cluster.")
-]
-TlsCa = Annotated[
-    str | None,
-    typer.Option(metavar="FILE", help="CA of the cluster's certificates, PEM; default GABLEWORK_TLS_CA."),
-]
-TlsCert = Annotated[
-    str | None,
-    typer.Option(metavar="FILE", help="This process's certificate for the cluster; default GABLEWORK_TLS_CERT."),
-]
-TlsKey = Annotated[
-    str | None,
-    typer.Option(metavar="FILE", help="Its key, unless in the same file; default GABLEWORK_TLS_KEY."),
-]
+def takes_options(command: str, **defaults: Any) -> Callable[[Command], Command]:
+    """Give a function the options of a run that a command takes, after its own; their values come as `**given`.
+
+    Parameters
+    ----------
+    command : str
+        Its name; `submit` takes what the service offers.
+    **defaults
+        Defaults of this command that differ.
+    """
+    by_name = [one for one in all_options() if command in one.meta["takers"]]
+    taken = served(files=True) if command == "submit" else by_name
+
+    def decorated(function: Command) -> Command:
+        own = [one for one in _parameters(function) if one.kind is not inspect.Parameter.VAR_KEYWORD]
+        set_parameters(function, [*own, *(_parameter(one, defaults.get(one.name, one.default)) for one in taken)])
+        return function
+
+    return decorated
 
 
-def tls_files(ca: str | None, cert: str | None, key: str | None) -> TlsFiles | None:
-    """The files of these three options or of the environment; None if there are none. Raises SettingsError."""
-    if not any((ca, cert, key)) and not any(name.startswith("GABLEWORK_TLS_") for name in os.environ):
-        return None
-    from pipeline.runtime.cluster.tls import given_tls
-
-    return given_tls(ca, cert, key)
+def set_parameters(function: Callable[..., None], parameters: Iterable[inspect.Parameter]) -> None:
+    """Make typer read these as the parameters of a function, which takes them as keywords."""
+    keywords = [one.replace(kind=inspect.Parameter.KEYWORD_ONLY) for one in parameters]
+    function.__signature__ = inspect.Signature(keywords)  # type: ignore[attr-defined]
+    function.__annotations__ = {one.name: one.annotation for one in keywords}
 
 
-PerformanceReport = Annotated[
-    str | None, typer.Option(metavar="FILE", help="Write a page (HTML) about the workers' time.")
-]
-MetricsPort = Annotated[
-    int | None,
-    typer.Option(metavar="N", min=1, max=65535, help="Show metrics for Prometheus on this port, at /metrics."),
-]
-MetricsHost = Annotated[
-    str, typer.Option(metavar="ADDRESS", help="Address of these metrics: anyone who reaches it can read them.")
-]
-LogJson = Annotated[bool, typer.Option("--log-json", help="Log one JSON object per line, like GABLEWORK_LOG_JSON=1.")]
-Scratch = Annotated[
-    str | None,
-    typer.Option(
-        metavar="DIR",
-        help="Folder for intermediate results, the same for all workers; default beside the results.",
-    ),
-]
-Meshes = Annotated[
-    Literal["building", "tile", "glb", "none"],
-    typer.Option(help="One OBJ per building, one OBJ per tile, one GLB per tile, or none."),
-]
-WithPoints = Annotated[
-    bool, typer.Option("--points", help="Also write the points as 3D Tiles, with their distances to the models.")
-]
-Terrain = Annotated[
-    Literal["none", "tin"] | None,
-    typer.Option(help="Also write the terrain: triangles with the buildings cut out; default from the settings."),
-]
-Licence = Annotated[
-    str | None, typer.Option(metavar="TEXT", help="Licence of the source data, written into the results.")
-]
-Truth = Annotated[
-    str | None, typer.Option(metavar="DIR", help="The truth that simulate wrote: measure the models against it.")
-]
-Points = Annotated[
-    list[str] | None,
-    typer.Option(metavar="TILE", help="A classified tile to measure against; repeat --points for several."),
-]
-AsSurveyed = Annotated[
-    bool, typer.Option("--as-surveyed", help="Move each true building by the shift of the strips that saw it.")
-]
-Isolate = typer.Option(
-    "--isolate/--no-isolate",
-    help="Model buildings in a supervised child process, so a bad one harms no other.",
-)
-BuildingTimeout = Annotated[
-    float, typer.Option(metavar="S", help="Seconds that a building may take in its child process.")
-]
-BuildingMemory = Annotated[
-    float, typer.Option(metavar="GIB", help="Memory that a building's child process may take, in GiB.")
-]
-InputTimeout = Annotated[
-    float, typer.Option(metavar="S", help="Seconds within which some more of an input must be read.")
-]
-INPUT_TIMEOUT_S = 600.0
-"""Default of `pipeline.io.reading`."""
-BUILDING_TIMEOUT_S, BUILDING_MEMORY_GIB = 600.0, 4.0
-"""Defaults of `pipeline.runtime.isolation.isolated_items.IsolationLimits`, which is too slow to import for `--help`."""
+def _parameters(function: Callable[..., None]) -> list[inspect.Parameter]:
+    return list(inspect.signature(function, eval_str=True).parameters.values())
 
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing run.")]
+
+def _parameter(option: Option, default: Any) -> inspect.Parameter:
+    """An option as typer reads it."""
+    meta, flag = option.meta, option.flag
+    kind, text = option.type, meta["doc"]
+    further: dict[str, Any] = {}
+    if meta["choices"] and not meta["metavar"]:
+        kind = Literal[meta["choices"]]
+    elif meta["choices"] and option.name == "method":
+        text = f"{text.removesuffix('.')}: {', '.join(meta['choices'])}."
+    if option.is_setting:
+        text = f"{text.removesuffix('.')}; default from the settings."
+    if option.name == "workers":
+        further = {"parser": worker_count, "show_default": AUTO}
+    if kind is bool:
+        flag = flag if option.default is False else f"{flag}/{flag.replace('--', '--no-', 1)}"
+    described = typer.Option(flag, metavar=meta["metavar"] or None, help=text, **further)
+    annotation: Any = Annotated[kind if default is not None else kind | None, described]
+    return inspect.Parameter(option.name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)

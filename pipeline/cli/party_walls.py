@@ -9,7 +9,7 @@ import typer
 
 from pipeline.cli.options import AsJson, Quiet
 from pipeline.console import Console
-from pipeline.party_walls.settings import PartyWallSettings
+from pipeline.extras.party_walls.settings import PartyWallSettings
 
 _DEFAULTS = PartyWallSettings()
 
@@ -35,7 +35,7 @@ def party_walls(
 ) -> None:
     """Find the walls that neighbouring buildings share, with their area. The run stays as it is."""
     with Console(as_json=as_json, quiet=quiet) as console:
-        from pipeline.runtime.party_walls import party_walls as write_party_walls
+        from pipeline.extras.party_walls.party_walls_of_run import party_walls as write_party_walls
 
         settings = PartyWallSettings(max_distance_m=max_distance, max_angle_deg=max_angle, min_area_m2=min_area)
         written = write_party_walls(

@@ -14,8 +14,8 @@ from pipeline.errors import SettingsError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from pipeline.extras.publish.publishing import Published
     from pipeline.model import Status
-    from pipeline.runtime.publishing import Published
 
 
 def publish(
@@ -55,14 +55,14 @@ def publish(
 ) -> None:
     """Write a finished run as files that other programs open. The run stays as it is."""
     with Console(as_json=as_json, quiet=quiet) as console:
-        from pipeline.runtime.publishing import (
+        from pipeline.extras.publish.publishing import (
             path_outside,
             publish_cityjson,
             publish_geopackage,
             publish_pmtiles,
             publish_stac,
         )
-        from pipeline.runtime.selection import run_of
+        from pipeline.extras.publish.selection import run_of
 
         forms = {
             "geopackage": publish_geopackage,
@@ -99,7 +99,7 @@ def _statuses(given: Sequence[str]) -> list[Status]:
 
 def _tiles(console: Console, run: str, out: str, overwrite: bool, geoid_height: float | None) -> Published:
     """Write 3D Tiles, and say how they were placed."""
-    from pipeline.runtime.publishing_3dtiles import publish_3dtiles
+    from pipeline.extras.publish_3dtiles.publishing_3dtiles import publish_3dtiles
 
     published = publish_3dtiles(run, out, overwrite=overwrite, geoid_height_m=geoid_height, on_event=console.on_event)
     facts = published.georeference

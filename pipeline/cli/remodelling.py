@@ -3,31 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from pipeline.cli.options import (
-    BUILDING_MEMORY_GIB,
-    BUILDING_TIMEOUT_S,
-    INPUT_TIMEOUT_S,
-    AsJson,
-    BuildingMemory,
-    BuildingTimeout,
-    InputTimeout,
-    Isolate,
-    Quiet,
-    Scheduler,
-    TlsCa,
-    TlsCert,
-    TlsKey,
-    Workers,
-    tls_files,
-)
+from pipeline.cli.options import AsJson, Quiet, takes_options
 from pipeline.console import Console, ExitCode
 from pipeline.runtime.isolation.preloading import start_early
 
 
+@takes_options("rerun")
 def rerun(
     run_dir: Annotated[str, typer.Argument(metavar="RUN", help="The directory of a finished run.")],
     overrides: Annotated[
@@ -38,45 +23,31 @@ def rerun(
         list[str] | None,
         typer.Option(metavar="ID", help="A building to model again in any case; repeat --only for several."),
     ] = None,
-    workers: Workers = None,
-    scheduler: Scheduler = None,
-    tls_ca: TlsCa = None,
-    tls_cert: TlsCert = None,
-    tls_key: TlsKey = None,
-    isolate: Annotated[bool | None, Isolate] = None,
-    input_timeout: InputTimeout = INPUT_TIMEOUT_S,
-    building_timeout: BuildingTimeout = BUILDING_TIMEOUT_S,
-    building_memory: BuildingMemory = BUILDING_MEMORY_GIB,
     as_json: AsJson = False,
     quiet: Quiet = False,
+    **given: Any,
 ) -> None:
     """Model single buildings of a run again, after other overrides; all others stay untouched."""
     with Console(as_json=as_json, quiet=quiet) as console:
+        from pipeline.extras.overrides.earlier import earlier_run, request_of
+        from pipeline.extras.overrides.rerun import RerunRequest
+        from pipeline.extras.overrides.rerun import rerun as rerun_buildings
         from pipeline.runtime.compiling import compile_for, kernel_groups
-        from pipeline.runtime.earlier import earlier_run, request_of
-        from pipeline.runtime.rerun import RerunRequest
-        from pipeline.runtime.rerun import rerun as rerun_buildings
-        from pipeline.runtime.resources import Resources
+        from pipeline.runtime.resources import resources_of
 
-        request = RerunRequest(
-            run_dir=run_dir,
-            overrides=overrides,
-            only=tuple(only or ()),
-            resources=Resources(
-                workers=workers,
-                scheduler=scheduler,
-                tls=tls_files(tls_ca, tls_cert, tls_key),
-                isolate=isolate,
-                input_timeout_s=input_timeout,
-                building_timeout_s=building_timeout,
-                building_memory_bytes=round(building_memory * 2**30),
-            ),
-        )
+        resources = resources_of(given)
+        request = RerunRequest(run_dir=run_dir, overrides=overrides, only=tuple(only or ()), resources=resources)
         earlier = request_of(earlier_run(run_dir).manifest)
         general = earlier.settings.general
         groups = kernel_groups(method=general.method, terrain=general.terrain)
-        compile_for(console.on_event, groups, earlier.inputs, (overrides,), scheduler=scheduler)
-        start_early("reconstruct", workers=workers, scheduler=scheduler, footprints=False, method=general.method)
+        compile_for(console.on_event, groups, earlier.inputs, (overrides,), scheduler=resources.scheduler)
+        start_early(
+            "reconstruct",
+            workers=resources.workers,
+            scheduler=resources.scheduler,
+            footprints=False,
+            method=general.method,
+        )
         summary = rerun_buildings(request, console.on_event)
         console.table("Made again", ["building", "status"], list(summary.buildings.items()))
         console.say(f"{len(summary.buildings)} buildings, {len(summary.tiles)} tiles written, {summary.seconds:.1f} s")
@@ -84,32 +55,31 @@ def rerun(
         console.document(dataclasses.asdict(summary))
 
 
+@takes_options("replay", isolate=True)
 def replay(
     bundle: Annotated[str, typer.Argument(metavar="BUNDLE", help="A file of a run's quarantine folder.")],
-    isolate: Annotated[bool, Isolate] = True,
-    building_timeout: BuildingTimeout = BUILDING_TIMEOUT_S,
-    building_memory: BuildingMemory = BUILDING_MEMORY_GIB,
     out: Annotated[
         str | None, typer.Option(metavar="DIR", help="Write the record, and the model as OBJ and CityJSON, here.")
     ] = None,
     as_json: AsJson = False,
+    **given: Any,
 ) -> None:
     """Model one quarantined building again, from its bundle alone."""
     with Console(as_json=as_json) as console:
         from pipeline import __version__
         from pipeline.io.places import on_this_machine
-        from pipeline.runtime.isolation.limits import IsolationLimits
         from pipeline.runtime.isolation.replay_bundle import read_bundle
         from pipeline.runtime.replay import replay as replay_building
         from pipeline.runtime.replay import replay_row, write_replay
+        from pipeline.runtime.resources import resources_of
 
-        limits = IsolationLimits(timeout_s=building_timeout, memory_bytes=round(building_memory * 2**30))
+        limits = resources_of(given).isolation
         with on_this_machine(bundle) as file:
             found = read_bundle(str(file))
         if found.incident.engine_version != __version__:
             console.warn(f"it happened to gablework {found.incident.engine_version}; this is {__version__}")
         console.say(f"{found.candidate.building_id} in its run: {found.incident.reason}, {found.incident.detail}")
-        replayed = replay_building(found, limits if isolate else None)
+        replayed = replay_building(found, limits)
         row = replay_row(found, replayed)
         console.table("This time", ["column", "value"], [(name, value) for name, value in row.items() if value != []])
         if replayed.loss is not None and replayed.loss.stderr:

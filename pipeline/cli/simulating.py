@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from pipeline.cli.options import AsJson, Overwrite, Quiet, Workers
+from pipeline.cli.options import AsJson, Overwrite, Quiet, takes_options
 from pipeline.cli.summary import show_summary
 from pipeline.console import Console
 
@@ -73,16 +73,17 @@ def simulate(
         console.document(dataclasses.asdict(paths))
 
 
+@takes_options("demo")
 def demo(
     out: Annotated[str, typer.Option(metavar="DIR", help="The folder of everything the demo makes.")] = "demo",
     size: Annotated[
         tuple[float, float] | None, typer.Option(metavar="EAST NORTH", help="Extent of the suburb in metres.")
     ] = None,
     seed: Annotated[int | None, typer.Option(metavar="N", help="Seed of the suburb; default its own.")] = None,
-    workers: Workers = None,
     overwrite: Overwrite = False,
     as_json: AsJson = False,
     quiet: Quiet = False,
+    **given: Any,
 ) -> None:
     """Simulate a small suburb, reconstruct it, measure it against the truth, draw it."""
     with Console(as_json=as_json, quiet=quiet) as console:
@@ -94,8 +95,8 @@ def demo(
         from pipeline.runtime.isolation.preloading import start_early
 
         compile_first(console.on_event, (*RECONSTRUCT, "simulate", "evaluate"))
-        start_early("reconstruct", workers=workers, scheduler=None, footprints=False, method=None)
-        made = demonstrate(out, console.on_event, workers=workers, overwrite=overwrite, size_m=size, seed=seed)
+        start_early("reconstruct", workers=given["workers"], scheduler=None, footprints=False, method=None)
+        made = demonstrate(out, console.on_event, workers=given["workers"], overwrite=overwrite, size_m=size, seed=seed)
         show_summary(console, made.summary)
         decisive = headline(chapters(made.evaluation))
         rows = [(line.label, line.value, line.interval, line.n) for _, line in decisive]

@@ -9,7 +9,7 @@ import typer
 
 from pipeline.cli.options import AsJson, Quiet
 from pipeline.console import Console
-from pipeline.solar.settings import SolarSettings
+from pipeline.extras.solar.settings import SolarSettings
 
 _DEFAULTS = SolarSettings()
 
@@ -44,7 +44,7 @@ def solar(
     """Compute each roof plane's view of the sky and its solar energy of a year. The run stays as it is."""
     with Console(as_json=as_json, quiet=quiet) as console:
         from pipeline.errors import SettingsError
-        from pipeline.runtime.solar import solar as write_solar
+        from pipeline.extras.solar.solar_of_run import solar as write_solar
 
         if weather is not None and (sky_only or turbidity is not None):
             other = "--sky-only" if sky_only else "--turbidity"

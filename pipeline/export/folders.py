@@ -13,10 +13,6 @@ TERRAIN_FOLDER = "terrain"
 """The terrain of all tiles."""
 
 
-MESHES = ("building", "tile", "glb", "none")
-"""One OBJ per building, one OBJ per tile, one GLB per tile, none."""
-
-
 Put = Callable[[str, bytes], None]
 """Stores bytes under a path relative to the run directory, atomically: readers see the old file or the new one."""
 

@@ -15,12 +15,13 @@ from pipeline.export.cityjson import cityjson_lines
 from pipeline.export.coordinates import one_unit
 from pipeline.export.decisions import decision_rows, decisions_path, decisions_table
 from pipeline.export.facts import RecordContext, RejectedObject
-from pipeline.export.folders import MESHES, Put, put_local
+from pipeline.export.folders import Put, put_local
 from pipeline.export.geoparquet import geo_table, parquet_bytes
 from pipeline.export.obj import obj_text
 from pipeline.export.records import building_row, plane_rows, rejected_row
 from pipeline.export.solid_geometry import lod_suffix, model_at
 from pipeline.model import BuildingResult
+from pipeline.options import MESHES
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -91,7 +92,7 @@ def mesh_files(
 ) -> Iterator[tuple[str, bytes]]:
     """The mesh files of a tile as path and content: one set with the records' models, one per coarser level of detail.
 
-    GLB files are made of the lines of the tile's CityJSONSeq. `meshes` is one of `pipeline.export.mesh_kinds.MESHES`.
+    GLB files are made of the lines of the tile's CityJSONSeq. `meshes` is one of `pipeline.options.MESHES`.
     """
     reference = one_unit(context.reference)
     units_m = reference.horizontal_unit_m, reference.vertical_unit_m
@@ -132,7 +133,7 @@ def write_tile(
     tile_key : str
         The hive key, such as x85_y447; never a bare integer, which readers would take for a number.
     meshes : str
-        One of `pipeline.export.mesh_kinds.MESHES`.
+        One of `pipeline.options.MESHES`.
     put : callable, optional
         Stores a file elsewhere, such as in an object store; `put_local(run_dir)` by default.
 

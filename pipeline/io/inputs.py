@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING
 from pipeline.errors import InputError, UnreadableInputError, all_at_fault
 from pipeline.io.formats import first_bytes, is_index
 from pipeline.io.locations import is_url, shown
+from pipeline.registry import extra
 
 if TYPE_CHECKING:
-    from pipeline.io.tile_index import TileIndex
+    from pipeline.extras.vector_files.tile_index import TileIndex
 
 Cut = Callable[["TileIndex"], Sequence[str]]
 """From an index to those of its files that are wanted."""
@@ -76,9 +77,8 @@ def _file(entry: str | Path) -> str:
 def _files_of(entry: str | Path, cut: Cut) -> list[str]:
     """The files of one path, folder, pattern, URL or index."""
     if is_url(entry):
-        from pipeline.io.remote_inputs import files_at
-
-        return files_at(str(entry), cut)
+        files: list[str] = extra("files_at")(str(entry), cut)
+        return files
     path = Path(entry)
     if path.is_dir():
         from pipeline.io.point_folders import files_in
@@ -93,6 +93,4 @@ def _files_of(entry: str | Path, cut: Cut) -> list[str]:
     first_bytes(path)
     if not is_index(path):
         return [str(path)]
-    from pipeline.io.tile_index import read_tile_index
-
-    return list(cut(read_tile_index(str(path))))
+    return list(cut(extra("read_tile_index")(str(path))))

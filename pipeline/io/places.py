@@ -7,12 +7,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pipeline.io.locations import is_url
 from pipeline.io.records import Readable
 from pipeline.io.storage import LocalStorage, Storage
+from pipeline.registry import extra
 
 if TYPE_CHECKING:
     import pyarrow.fs as pafs
-from pipeline.io.locations import is_url
 
 
 def storage_at(place: str | Path) -> Storage:
@@ -22,9 +23,8 @@ def storage_at(place: str | Path) -> Storage:
     's3://bucket/runs/a'
     """
     if isinstance(place, str) and is_url(place):
-        from pipeline.io.object_storage import ObjectStorage
-
-        return ObjectStorage(url=place)
+        storage: Storage = extra("ObjectStorage")(url=place)
+        return storage
     return LocalStorage(root=Path(place).resolve())
 
 
@@ -32,9 +32,8 @@ def file_at(location: str | Path) -> Readable:
     """A file of this machine, or behind a URL."""
     if not is_url(location):
         return Path(location)
-    from pipeline.io.remote_file import RemoteFile
-
-    return RemoteFile(str(location))
+    file: Readable = extra("RemoteFile")(str(location))
+    return file
 
 
 @contextlib.contextmanager
@@ -46,10 +45,9 @@ def on_this_machine(location: str | Path) -> Iterator[Path]:
     if not is_url(location):
         yield Path(location)
         return
-    from pipeline.io.remote_file import RemoteFile
     from pipeline.io.temporary import temporary_folder
 
-    file = RemoteFile(str(location))
+    file = extra("RemoteFile")(str(location))
     with temporary_folder() as folder:
         path = folder / f"file{file.suffix}"
         file.fetch(path)
@@ -89,8 +87,5 @@ def arrow_at(place: str | Path) -> tuple[pafs.FileSystem, str]:
 
     if not is_url(str(place)):
         return pafs.LocalFileSystem(), str(place)
-    from pipeline.io.arrow_objects import ObjectHandler
-    from pipeline.io.object_storage import ObjectStorage
-
-    storage = ObjectStorage(url=str(place))
-    return pafs.PyFileSystem(ObjectHandler(storage.url)), storage.url.partition("://")[2]
+    storage = extra("ObjectStorage")(url=str(place))
+    return pafs.PyFileSystem(extra("ObjectHandler")(storage.url)), storage.url.partition("://")[2]

@@ -16,11 +16,9 @@ from types import FrameType
 from typing import NoReturn
 
 from pipeline.errors import UnreadableInputError
+from pipeline.options import ResourceOptions
 
-INPUT_TIMEOUT_S = 600.0
-"""Default of `--input-timeout`: a slow disk delivers a piece of some megabytes in seconds."""
-
-_limit_s: ContextVar[float] = ContextVar("input_timeout_s", default=INPUT_TIMEOUT_S)
+_limit_s: ContextVar[float] = ContextVar("input_timeout_s", default=ResourceOptions.input_timeout_s)
 _listener: Callable[[], object] | None = None
 """What hears of progress: the alarm of this process, or the report to its supervisor."""
 _watcher: Callable[[], None] | None = None

@@ -23,6 +23,7 @@ from pipeline.io.reading import one_input
 from pipeline.io.records import DivisibleFile, FileFacts, FileStatus, PointFile, PointRecords, Readable, Share, Window
 from pipeline.io.strays import MOST_STRAYS, ROUNDING, off_earth, without_strays
 from pipeline.model import BoolArray, ByteArray, FloatArray, PointCloud
+from pipeline.registry import extra
 
 if TYPE_CHECKING:
     from shapely import MultiPolygon, Polygon
@@ -56,7 +57,7 @@ class ReadOptions:
     class_table: tuple[int, ...] | None = None
     """The ASPRS class of each of the 256 codes of the file; None where its codes are those of ASPRS."""
     ascii_columns: str | None = None
-    """Names of the columns of ASCII files, see `pipeline.io.ascii`; None to find out."""
+    """Names of the columns of ASCII files, see `pipeline.extras.ply_ascii.ascii`; None to find out."""
 
     def __post_init__(self) -> None:
         """Check every field."""
@@ -213,15 +214,13 @@ def _open_las(path: Readable, _options: ReadOptions, facts: FileFacts | None = N
 
 
 def _open_ply(path: Readable, _options: ReadOptions, facts: FileFacts | None = None, /) -> PointFile:
-    from pipeline.io.ply import PlyFile
-
-    return PlyFile(path, facts)
+    file: PointFile = extra("PlyFile")(path, facts)
+    return file
 
 
 def _open_ascii(path: Readable, options: ReadOptions, facts: FileFacts | None = None, /) -> PointFile:
-    from pipeline.io.ascii import AsciiFile
-
-    return AsciiFile(path, options.ascii_columns, facts)
+    file: PointFile = extra("AsciiFile")(path, options.ascii_columns, facts)
+    return file
 
 
 READERS: dict[str, Reader] = {

@@ -1,7 +1,7 @@
 """Storage of complete things only: in a folder, a file gets its name after its last byte is on the disk.
 
 `Storage` holds a run directory, in a folder (`LocalStorage`) or in an object store
-(`pipeline.io.object_storage`). `pipeline.io.storage_at` gives the one that a path or URL means.
+(`pipeline.extras.remote.object_storage`). `pipeline.io.storage_at` gives the one that a path or URL means.
 """
 
 from __future__ import annotations

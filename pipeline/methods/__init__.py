@@ -69,7 +69,7 @@ class Method:
         return settings
 
 
-_SETTINGS = "pipeline.methods.settings:"
+_PAPERS = "pipeline.extras.papers."
 METHODS: Mapping[str, Method] = {
     method.name: method
     for method in (
@@ -79,14 +79,18 @@ METHODS: Mapping[str, Method] = {
             "pipeline.segmentation.plane_settings:AdaptivePlaneSettings",
             follows_paper=False,
         ),
-        Method("fuzzy-sart", "pipeline.methods.fuzzy_sart:segment", f"{_SETTINGS}FuzzySartSettings"),
+        Method("fuzzy-sart", f"{_PAPERS}fuzzy_sart:segment", f"{_PAPERS}settings:FuzzySartSettings"),
         Method(
-            "parameter-space-2d", "pipeline.methods.parameter_space:segment_2d", f"{_SETTINGS}ParameterSpace2dSettings"
+            "parameter-space-2d",
+            f"{_PAPERS}parameter_space:segment_2d",
+            f"{_PAPERS}settings:ParameterSpace2dSettings",
         ),
         Method(
-            "parameter-space-3d", "pipeline.methods.parameter_space:segment_3d", f"{_SETTINGS}ParameterSpace3dSettings"
+            "parameter-space-3d",
+            f"{_PAPERS}parameter_space:segment_3d",
+            f"{_PAPERS}settings:ParameterSpace3dSettings",
         ),
-        Method("kmeans", "pipeline.methods.kmeans:segment", f"{_SETTINGS}KMeansSettings"),
+        Method("kmeans", f"{_PAPERS}kmeans:segment", f"{_PAPERS}settings:KMeansSettings"),
     )
 }
 """All methods by name. A recipe and its kernels load when a building is first segmented by it."""

@@ -14,9 +14,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import PathCollection
 from matplotlib.colors import to_rgb
-from matplotlib.path import Path as DrawnPath
 
 from pipeline.model import FloatArray
+from pipeline.report.pictures import drawn_path
 
 Colour = tuple[float, float, float]
 
@@ -38,6 +38,10 @@ class ViewedFace:
     """Outer ring and holes, each (n, 3) metres, oriented as seen from outside."""
     colour: str
     """Its colour in full light."""
+
+    def about(self, origin: FloatArray) -> ViewedFace:
+        """The same face about an origin (3,)."""
+        return dataclasses.replace(self, rings=tuple(ring - origin for ring in self.rings))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -65,16 +69,6 @@ def shaded(colour: str, brightness: float) -> Colour:
     return red * brightness, green * brightness, blue * brightness
 
 
-def drawn_path(rings: Sequence[FloatArray]) -> DrawnPath:
-    """One path of an outer ring and its holes; the rings are (n, 2), the first vertex not repeated."""
-    parts = []
-    for ring in rings:
-        codes = np.full(len(ring) + 1, DrawnPath.LINETO, dtype=np.uint8)
-        codes[0], codes[-1] = DrawnPath.MOVETO, DrawnPath.CLOSEPOLY
-        parts.append(DrawnPath(np.vstack([ring, ring[:1]]), codes))
-    return DrawnPath.make_compound_path(*parts)
-
-
 def face_normal(rings: Sequence[FloatArray]) -> FloatArray:
     """Area vector of a face by its outer ring (Newell), shape (3,)."""
     ring = rings[0] - rings[0][0]
@@ -82,16 +76,27 @@ def face_normal(rings: Sequence[FloatArray]) -> FloatArray:
     return normal
 
 
-def draw_view(axes: Axes, buildings: Sequence[Sequence[ViewedFace]], view: View, *, shadows: bool = True) -> None:
-    """Draw buildings, each a sequence of faces; the axes become a frameless picture of equal scale."""
+def draw_view(
+    axes: Axes,
+    models: Sequence[Sequence[ViewedFace]],
+    view: View,
+    *,
+    origin: FloatArray | None = None,
+    shadows: bool = True,
+) -> None:
+    """Draw buildings, each a sequence of faces; the axes become a frameless picture of equal scale.
+
+    Without an `origin` (3,) near the buildings they must lie near the origin of the coordinates.
+    """
     right, up, towards = _basis(view)
+    buildings = [faces if origin is None else [face.about(origin) for face in faces] for faces in models]
     centres = [np.mean(np.vstack([face.rings[0] for face in faces]), axis=0) for faces in buildings]
     order = sorted(range(len(buildings)), key=lambda i: (float(centres[i][:2] @ towards[:2]), i))
     screen = np.stack([right, up])
     if shadows:
         thrown = [drawn_path([ring @ screen.T for ring in rings]) for faces in buildings for rings in _shadow(faces)]
         axes.add_collection(PathCollection(thrown, facecolors=_SHADOW, edgecolors=_SHADOW, linewidths=0.3))
-    paths: list[DrawnPath] = []
+    paths = []
     fills: list[Colour] = []
     lines: list[Colour] = []
     for index in order:

@@ -19,6 +19,7 @@ from pipeline.model import FloatArray
 
 COLOURS = 128
 """Colours of a picture: so few make a PNG a third as large."""
+_MARGIN = 0.06
 
 
 def blank(width_px: int, height_px: int) -> tuple[Figure, Axes]:
@@ -27,6 +28,19 @@ def blank(width_px: int, height_px: int) -> tuple[Figure, Axes]:
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.set_axis_off()
     return figure, axes
+
+
+def set_frame(axes: Axes, places: FloatArray) -> float:
+    """Show all places (n, 2) with a margin, at one scale in both directions; returns the shown width."""
+    low, high = places.min(axis=0), places.max(axis=0)
+    width_px, height_px = axes.figure.get_size_inches()
+    size = np.maximum(high - low, 1.0) * (1.0 + 2.0 * _MARGIN)
+    width = max(float(size[0]), float(size[1]) * width_px / height_px)
+    (x, y), half = (low + high) / 2.0, width * height_px / width_px / 2.0
+    axes.set_aspect("auto")
+    axes.set_xlim(x - width / 2.0, x + width / 2.0)
+    axes.set_ylim(y - half, y + half)
+    return width
 
 
 def png_of(figure: Figure) -> bytes:
@@ -44,20 +58,24 @@ def data_uri(png: bytes) -> str:
     return f"data:image/png;base64,{base64.b64encode(png).decode('ascii')}"
 
 
-def paths_of(geometries: Sequence[Any]) -> list[DrawnPath]:
-    """One path per geometry (polygon or multipolygon, with holes); missing and empty ones get an empty path."""
-    return [_path(geometry) for geometry in geometries]
-
-
-def _path(geometry: Any) -> DrawnPath:
-    rings = [] if geometry is None else shapely.get_rings(shapely.force_2d(geometry))
-    corners: list[FloatArray] = [shapely.get_coordinates(ring) for ring in rings]
-    corners = [ring for ring in corners if len(ring) > 3]
-    if not corners:
+def drawn_path(rings: Sequence[FloatArray]) -> DrawnPath:
+    """One path of outer rings and holes; the rings are (n, 2), the first vertex not repeated. Empty without rings."""
+    if not rings:
         return DrawnPath(np.zeros((1, 2)))
     codes = []
-    for ring in corners:
-        code = np.full(len(ring), DrawnPath.LINETO, dtype=np.uint8)
+    for ring in rings:
+        code = np.full(len(ring) + 1, DrawnPath.LINETO, dtype=np.uint8)
         code[0], code[-1] = DrawnPath.MOVETO, DrawnPath.CLOSEPOLY
         codes.append(code)
-    return DrawnPath(np.vstack(corners), np.concatenate(codes))
+    return DrawnPath(np.vstack([corners for ring in rings for corners in (ring, ring[:1])]), np.concatenate(codes))
+
+
+def paths_of(geometries: Sequence[Any]) -> list[DrawnPath]:
+    """One path per geometry (polygon or multipolygon, with holes); missing and empty ones get an empty path."""
+    return [drawn_path([ring[:-1] for ring in plan_rings(geometry) if len(ring) > 3]) for geometry in geometries]
+
+
+def plan_rings(geometry: Any) -> list[FloatArray]:
+    """All rings of a geometry in plan, closed, (n, 2) each; none of a missing one."""
+    rings = [] if geometry is None else shapely.get_rings(shapely.force_2d(geometry))
+    return [shapely.get_coordinates(ring) for ring in rings]

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +20,11 @@ from matplotlib.patches import Patch, Rectangle
 
 from pipeline.errors import RunError
 from pipeline.export.geoparquet import read_table
-from pipeline.export.glb import record_level
 from pipeline.io import arrow_at
 from pipeline.model import RoofType, Status
 from pipeline.report.maps import round_length
-from pipeline.report.perspective import MAP_SUN, View, ViewedFace, draw_view, drawn_path, lambert, shaded
+from pipeline.report.perspective import MAP_SUN, View, ViewedFace, draw_view, lambert, shaded
+from pipeline.report.pictures import paths_of, plan_rings
 from pipeline.report.statistics import run_statistics
 from pipeline.runtime.manifest import NAME
 from pipeline.runtime.manifest_reading import read_manifest
@@ -88,9 +88,11 @@ def render_run(
     if is_part:
         _draw_window(plan, window)
     if window != NO_WINDOW:
-        models = _solids(run, buildings, window, units, filesystem)
+        inside = shapely.intersects(shapely.centroid(_geometries(buildings)), shapely.box(*window))
+        rows = buildings.filter(pa.array(inside)).select(["roof_type", "solid", "solid_surfaces"]).to_pylist()
+        models = [faces for row in rows if (faces := solid_faces(row, units))]
         if models:
-            draw_view(view, models, View())
+            draw_view(view, models, View(), origin=np.array([window[0] * units[0], window[1] * units[0], 0.0]))
     view.set_axis_off()
     statistics = run_statistics(run, filesystem)
     figure.suptitle(_title(statistics, buildings), fontsize=15, x=0.01, ha="left")
@@ -135,40 +137,26 @@ def view_window(faces: Any, unit_m: float) -> tuple[Window, bool]:
     return (left, bottom, left + side, bottom + side), True
 
 
-def _rings(polygon: shapely.Polygon) -> list[Any]:
-    """The rings of a polygon in plan, first vertex not repeated."""
-    return [shapely.get_coordinates(ring)[:-1] for ring in (polygon.exterior, *polygon.interiors)]
-
-
 def _draw_map(axes: Axes, buildings: pa.Table, planes: pa.Table, rejected: pa.Table, truth: Any) -> None:
     """Roof faces, outlines, failed candidates and rejected objects."""
     kinds = dict(zip(buildings["building_id"].to_pylist(), buildings["roof_type"].to_pylist(), strict=True))
-    paths, fills = [], []
-    rows = zip(
-        _geometries(planes),
-        planes["building_id"].to_pylist(),
-        planes["slope_deg"].to_pylist(),
-        planes["aspect_deg"].to_pylist(),
-        strict=True,
-    )
-    for geometry, building_id, slope, aspect in rows:
-        if geometry is None:
-            continue
+    fills = []
+    for building_id, slope, aspect in zip(
+        *(planes[name].to_pylist() for name in ("building_id", "slope_deg", "aspect_deg")), strict=True
+    ):
         tilt, turn = math.radians(slope), math.radians(aspect)
         light = lambert((math.sin(tilt) * math.sin(turn), math.sin(tilt) * math.cos(turn), math.cos(tilt)), MAP_SUN)
-        for polygon in shapely.get_parts(geometry):
-            paths.append(drawn_path(_rings(polygon)))
-            fills.append(shaded(ROOF_COLOURS[RoofType(kinds[building_id])], light))
-    axes.add_collection(PathCollection(paths, facecolors=fills, edgecolors="#55504a", linewidths=0.25))
+        fills.append(shaded(ROOF_COLOURS[RoofType(kinds[building_id])], light))
+    faces = paths_of(_geometries(planes))
+    axes.add_collection(PathCollection(faces, facecolors=fills, edgecolors="#55504a", linewidths=0.25))
     _draw_outlines(axes, _geometries(rejected), color="#9a9a9a", linewidths=0.5)
     footprints = _geometries(buildings)
     _draw_outlines(axes, footprints, color="#2b2b2b", linewidths=0.6)
     statuses = np.array(buildings["status"].to_pylist(), dtype=object)
     for status, (hatch, colour) in HATCHES.items():
-        chosen = [g for g, s in zip(footprints, statuses, strict=True) if s == status and g is not None]
-        hatched = [drawn_path(_rings(part)) for g in chosen for part in shapely.get_parts(g)]
-        if hatched:
-            marked = PathCollection(hatched, facecolors="none", edgecolors=colour, linewidths=0.9)
+        hatched = footprints[(statuses == status) & ~shapely.is_missing(footprints)]
+        if len(hatched):
+            marked = PathCollection(paths_of(hatched), facecolors="none", edgecolors=colour, linewidths=0.9)
             marked.set_hatch(hatch)
             axes.add_collection(marked)
     if truth is not None:
@@ -183,14 +171,7 @@ def _draw_map(axes: Axes, buildings: pa.Table, planes: pa.Table, rejected: pa.Ta
 
 def _draw_outlines(axes: Axes, geometries: Any, **style: Any) -> None:
     """The rings of polygons as lines."""
-    lines = [
-        np.vstack([ring, ring[:1]])
-        for geometry in geometries
-        if geometry is not None
-        for part in shapely.get_parts(geometry)
-        for ring in _rings(part)
-    ]
-    axes.add_collection(LineCollection(lines, **style))
+    axes.add_collection(LineCollection([ring for one in geometries for ring in plan_rings(one)], **style))
 
 
 def _draw_scale_bar(axes: Axes, unit_m: float) -> None:
@@ -212,48 +193,22 @@ def _draw_window(axes: Axes, window: Window) -> None:
     )
 
 
-def _solids(
-    run_dir: str,
-    buildings: pa.Table,
-    window: Window,
-    units: tuple[float, float],
-    filesystem: pafs.FileSystem,
-) -> list[list[ViewedFace]]:
-    """The faces of the buildings in a window, in metres about its corner, from the run's CityJSON files."""
-    footprints = _geometries(buildings)
-    inside = shapely.intersects(shapely.centroid(footprints), shapely.box(*window))
-    rows = buildings.filter(pa.array(inside))
-    kinds = dict(zip(rows["building_id"].to_pylist(), rows["roof_type"].to_pylist(), strict=True))
-    models = []
-    for tile in sorted(set(rows["tile"].to_pylist())):
-        path = f"{run_dir.rstrip('/')}/cityjson/tile={tile}/part-0.city.jsonl"
-        with filesystem.open_input_stream(path) as stream:
-            lines = stream.read().decode().splitlines()
-        transform = json.loads(lines[0])["transform"]
-        scale, shift = (np.array(transform[name]) for name in ("scale", "translate"))
-        metres = np.array([units[0], units[0], units[1]])
-        for line in lines[1:]:
-            feature = json.loads(line)
-            kind = kinds.get(feature["id"])
-            if kind is not None and feature["vertices"]:
-                local = (np.array(feature["vertices"]) * scale + shift - [window[0], window[1], 0.0]) * metres
-                models.append(_viewed_faces(feature, local, ROOF_COLOURS[RoofType(kind)]))
-    return models
-
-
-def _viewed_faces(feature: dict[str, Any], xyz: Any, roof_colour: str) -> list[ViewedFace]:
-    """Roofs and walls of a CityJSONFeature, at the level of detail of its record."""
-    faces = []
-    level = record_level(feature)
-    for entry in feature["CityObjects"].values():
-        for solid in (geometry for geometry in entry.get("geometry", ()) if geometry["lod"] == level):
-            surfaces = [surface["type"] for surface in solid["semantics"]["surfaces"]]
-            for shell, values in zip(solid["boundaries"], solid["semantics"]["values"], strict=True):
-                for rings, value in zip(shell, values, strict=True):
-                    if surfaces[value] in _SURFACE_KINDS:
-                        colour = roof_colour if surfaces[value] == "RoofSurface" else WALL_COLOUR
-                        faces.append(ViewedFace(rings=tuple(xyz[ring] for ring in rings), colour=colour))
-    return faces
+def solid_faces(row: Mapping[str, Any], units: tuple[float, float], roof_colour: str | None = None) -> list[ViewedFace]:
+    """Roofs and walls of the solids of a row of the table `buildings`, in metres; by default by its roof type."""
+    horizontal, vertical = units
+    roof = roof_colour or ROOF_COLOURS[RoofType(row["roof_type"])]
+    parts = [] if row["solid"] is None else shapely.get_parts(shapely.from_wkb(row["solid"])).tolist()
+    return [
+        ViewedFace(
+            rings=tuple(
+                shapely.get_coordinates(ring, include_z=True)[:-1] * [horizontal, horizontal, vertical]
+                for ring in shapely.get_rings(part)
+            ),
+            colour=roof if kind == "RoofSurface" else WALL_COLOUR,
+        )
+        for part, kind in zip(parts, row["solid_surfaces"] or (), strict=True)
+        if kind in _SURFACE_KINDS
+    ]
 
 
 def _title(statistics: dict[str, Any], buildings: pa.Table) -> str:

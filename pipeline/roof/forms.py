@@ -14,6 +14,7 @@ from shapely import MultiPolygon
 
 from pipeline.errors import BuildingError
 from pipeline.model import Decision, DecisionKind, Outcome, Plane
+from pipeline.registry import extra
 from pipeline.roof.named_form import ARRANGEMENT, MOST_TEMPLATE_POINTS, SIMPLER, TEMPLATES, NamedForm, RankedFaces
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.plan import RoofPoints, arranged_faces, drawn_outline, partition_roof
@@ -45,14 +46,10 @@ def arranged_forms(
     """
     outline_mm = drawn_outline(roof, settings)
     if roof.footprint_mm is not None:
-        from pipeline.roof.voids import without_voids
-
-        outline_mm = without_voids(outline_mm, roof.points, roof.spacing_m, settings)
+        outline_mm = extra("without_voids")(outline_mm, roof.points, roof.spacing_m, settings)
     elif roof.guides:
-        from pipeline.roof.guides import guide_steps, guided_outline
-
-        with guide_steps():
-            outline_mm = guided_outline(outline_mm, roof.guides, roof.xy_mm, roof.guide_distance_m)
+        with extra("guide_steps")():
+            outline_mm = extra("guided_outline")(outline_mm, roof.guides, roof.xy_mm, roof.guide_distance_m)
     first, last = _competing_forms(roof, planes, outline_mm, settings, costs, decisions)
     yield from first
     # many planes that meet nearly in one point: with more room between its vertices the solid is valid
@@ -80,7 +77,7 @@ def template_forms(roof: RoofPoints, lack: BuildingError, settings: RoofSettings
     """The templates alone, where no planes were found; raises `lack` where there are no templates either."""
     if len(roof.points) > MOST_TEMPLATE_POINTS:
         raise lack
-    from pipeline.roof.templates.fitting import fit_templates
+    fit_templates = extra("fit_templates")
 
     try:
         outline_mm = drawn_outline(roof, settings)
@@ -110,10 +107,8 @@ def _competing_forms(
     alone = (NamedForm(ARRANGEMENT, arranged, within),), ()
     if roof.spacing_m < settings.templates_spacing_m or len(roof.points) > MOST_TEMPLATE_POINTS:
         return alone
-    from pipeline.roof.templates.fitting import fit_templates, margin_of_templates
-
     try:
-        templates = fit_templates(roof.points, outline_mm)
+        templates = extra("fit_templates")(roof.points, outline_mm)
     except UNDRAWABLE as error:
         decisions.append(undrawable(TEMPLATES, error))
         return alone
@@ -123,7 +118,7 @@ def _competing_forms(
         decisions.append(undrawable(ARRANGEMENT, error))
         return (NamedForm(TEMPLATES, templates.faces, within),), ()
     drawn_planes = drawn.planes or tuple(planes)
-    margin = margin_of_templates(roof.points, templates, drawn, drawn_planes)
+    margin = extra("margin_of_templates")(roof.points, templates, drawn, drawn_planes)
     own = RankedFaces(partition=drawn, planes=drawn_planes, labels=roof.labels, bic_margin=-margin)
     form: FaceForm = NamedForm(TEMPLATES, partial(templates.faces, margin), within)
     own_form: FaceForm = NamedForm(ARRANGEMENT, lambda: own, within)

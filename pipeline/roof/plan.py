@@ -27,6 +27,7 @@ from pipeline.model import (
     Reason,
     WallOutline,
 )
+from pipeline.registry import extra
 from pipeline.roof.arrangement.arranging import arrange
 from pipeline.roof.arrangement.guide_lines import NO_GUIDES, Guides
 from pipeline.roof.eaves import straighten
@@ -38,7 +39,7 @@ from pipeline.roof.settings import ArrangementSettings, RoofSettings
 from pipeline.tin.delaunay import triangulate
 
 if TYPE_CHECKING:
-    from pipeline.roof.facades import FacadePoints, Walls
+    from pipeline.extras.lods.facades import FacadePoints, Walls
 
 _PITCH_SPACINGS = 1.2
 """Pitch of the samples in empty places, in point spacings: about as dense as the points."""
@@ -133,9 +134,10 @@ def _in_mm(footprint: Polygon | MultiPolygon | None) -> MultiPolygon | None:
 
 def _facades(candidate: Candidate, points: FloatArray) -> FacadePoints:
     """The points that show the walls beneath a roof with some points (n, 3)."""
-    from pipeline.roof.facades import FacadePoints
-
-    return FacadePoints.of(candidate.beside, candidate.beside_later, points, candidate.ground, candidate.ground_z_m)
+    facades: FacadePoints = extra("FacadePoints").of(
+        candidate.beside, candidate.beside_later, points, candidate.ground, candidate.ground_z_m
+    )
+    return facades
 
 
 @kernel
@@ -244,10 +246,8 @@ def _traced_plan(roof: RoofPoints, planes: Sequence[Plane], settings: RoofSettin
         edge_points = EdgePoints.of(roof.xy_mm, roof.split, roof.spacing_m)
         drawn = straighten(around, roof.spacing_m, settings, edge_points)
         if roof.facades is not None and settings.at_walls:
-            from pipeline.roof.facades import walls_beneath
-
             reach_m = 1e-3 * mixed_pulse_reach_mm(around, edge_points)
-            drawn = walls_beneath(drawn, roof.facades, reach_m, settings.usual_overhang_m).outline_mm
+            drawn = extra("walls_beneath")(drawn, roof.facades, reach_m, settings.usual_overhang_m).outline_mm
     return RoofPlan(planes=tuple(planes), faces=faces, outline_mm=drawn, raw=partition)
 
 
@@ -271,12 +271,14 @@ def walls_of(footprint: Polygon | MultiPolygon, roof: RoofPoints, settings: Roof
     """The walls beneath a footprint at the eaves, local metres; None where they are not asked for."""
     if roof.facades is None or roof.footprint_mm is not None or not settings.finds_walls:
         return None
-    from pipeline.roof.facades import walls_beneath
     from pipeline.roof.footprint_in_mm import footprint_in_mm
 
     eaves_mm = footprint_in_mm(footprint)
     reach_mm = mixed_pulse_reach_mm(eaves_mm, EdgePoints.of(roof.xy_mm, roof.split, roof.spacing_m))
-    return walls_beneath(eaves_mm, roof.facades, 1e-3 * reach_mm, settings.usual_overhang_m, settings.min_overhang_m)
+    walls: Walls | None = extra("walls_beneath")(
+        eaves_mm, roof.facades, 1e-3 * reach_mm, settings.usual_overhang_m, settings.min_overhang_m
+    )
+    return walls
 
 
 def wall_outline(walls: Walls | None) -> WallOutline | None:
@@ -314,16 +316,17 @@ def arranged_faces(
     free = arranged(NO_GUIDES)
     if not roof.guides:
         return free
-    from pipeline.roof.enclosed_planes import with_enclosed_planes
-    from pipeline.roof.guided_faces import guided_faces
-    from pipeline.roof.guides import guide_steps, inner_pieces
-
-    with guide_steps():
-        pieces, may_step = inner_pieces(roof.guides, outline_mm)
+    with extra("guide_steps")():
+        pieces, may_step = extra("inner_pieces")(roof.guides, outline_mm)
         guides = Guides(pieces, roof.guide_distance_m)
-        coefficients, labels = with_enclosed_planes(roof.points, labels, coefficients, pieces, outline_mm, costs)
+        coefficients, labels = extra("with_enclosed_planes")(
+            roof.points, labels, coefficients, pieces, outline_mm, costs
+        )
         beside_m = max(guides.distance_m, roof.spacing_m)
-        return guided_faces(arranged, free, roof.points, guides, may_step, beside_m, costs.residual_cap_m)
+        followed: RoofPartition = extra("guided_faces")(
+            arranged, free, roof.points, guides, may_step, beside_m, costs.residual_cap_m
+        )
+        return followed
 
 
 def min_face_area(roof: RoofPoints, settings: RoofSettings) -> float:

@@ -13,6 +13,8 @@ from shapely import MultiPolygon, Polygon
 from pipeline.io import ReadOptions, SourceInfo, SpatialReference, find_inputs, is_url, open_source, sha256_of, shown
 from pipeline.io.places import on_this_machine
 from pipeline.io.reading import one_input, set_input_timeout
+from pipeline.options import ModelFiles, ModelOptions, options_of
+from pipeline.registry import extra
 from pipeline.runtime.cluster.serial_executor import Executor
 from pipeline.runtime.manifest import InputFile
 from pipeline.runtime.monitoring.progress import Progress, Watch, never
@@ -22,11 +24,11 @@ from pipeline.runtime.scratch.location import SCRATCH
 from pipeline.settings import RunSettings
 
 if TYPE_CHECKING:
-    from pipeline.io.tile_index import TileIndex
+    from pipeline.extras.vector_files.tile_index import TileIndex
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class RunRequest:
+class RunRequest(ModelFiles, ModelOptions):
     """What to reconstruct, and how."""
 
     inputs: tuple[str, ...]
@@ -37,33 +39,9 @@ class RunRequest:
     """All settings."""
     resources: Resources = dataclasses.field(default_factory=Resources)
     """What the run runs with."""
-    footprints: str | None = None
-    """A vector file of the building outlines to model."""
-    footprints_layer: str | None = None
-    """Their layer, where the file has several; None for the only one."""
-    guides: str | None = None
-    """A vector file of lines of roofs."""
-    overrides: str | None = None
-    """A TOML file of corrections to single buildings; `pipeline.runtime.overrides.overrides_file`."""
-    crs: str | None = None
-    """Overrides the CRS in the headers."""
-    vertical_unit: str | None = None
-    """Overrides the vertical unit in the headers."""
-    allow_outside_area_of_use: bool = False
-    """Accept inputs that lie far outside the area of use of their CRS."""
-    bbox: tuple[float, float, float, float] | None = None
-    """x_min, y_min, x_max, y_max in the CRS's units."""
-    aoi: str | None = None
-    """A vector file of areas of interest."""
     only_files: bool = False
     """Take each input for the path of a file and follow neither folders, patterns, URLs nor tile indexes: for inputs
     that strangers name."""
-    meshes: str = "building"
-    """One OBJ per building, one per tile, or none."""
-    points: bool = False
-    """Also write the points as 3D Tiles, with their distances to the models."""
-    licence: str | None = None
-    """Licence of the source data, in the user's words."""
     overwrite: bool = False
     """Replace an earlier run in `out`."""
 
@@ -131,10 +109,8 @@ def plan_inputs(
 
 def _area(path: str, reference: SpatialReference) -> Polygon | MultiPolygon:
     """The area of interest, read within the time limit of an input."""
-    from pipeline.io.footprints import read_area
-
     with one_input(shown(path)):
-        return read_area(path, reference)
+        return extra("read_area")(path, reference)
 
 
 def input_file(name: str) -> InputFile:
@@ -145,22 +121,11 @@ def input_file(name: str) -> InputFile:
 
 def request_record(request: RunRequest) -> dict[str, object]:
     """The part of the request stored in `run.json`, from which single buildings of the run can be modelled again."""
-    files = {
-        "footprints": request.footprints,
-        "guides": request.guides,
-        "overrides": request.overrides,
-        "aoi": request.aoi,
-        "work": request.work,
-    }
-    return {
-        **{name: None if path is None else _whole(path) for name, path in files.items()},
-        "footprints_layer": request.footprints_layer,
-        "crs": request.crs,
-        "vertical_unit": request.vertical_unit,
-        "bbox": None if request.bbox is None else list(request.bbox),
-        "meshes": request.meshes,
-        "points": request.points,
-    }
+    found: dict[str, object] = {"work": None if request.work is None else _whole(request.work)}
+    for option in options_of(ModelFiles, ModelOptions):
+        value = getattr(request, option.name)
+        found[option.name] = _whole(value) if option.is_path and value is not None else value
+    return found
 
 
 def _whole(path: str) -> str:

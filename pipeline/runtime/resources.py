@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import TYPE_CHECKING
+import os
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import SettingsError
-from pipeline.io.reading import INPUT_TIMEOUT_S
+from pipeline.options import ResourceOptions, values_of
 from pipeline.runtime.isolation.limits import IsolationLimits
 
 if TYPE_CHECKING:
@@ -36,7 +38,7 @@ class Resources:
     """Wall-clock seconds that one isolated building may take."""
     building_memory_bytes: int = IsolationLimits.memory_bytes
     """Memory that the process of one isolated building may take."""
-    input_timeout_s: float = INPUT_TIMEOUT_S
+    input_timeout_s: float = ResourceOptions.input_timeout_s
     """Wall-clock seconds within which some more of an input must be read."""
     scratch: str | None = None
     """A folder for intermediate results that all workers see; by default the run directory, or a temporary folder of
@@ -73,6 +75,22 @@ class Resources:
         if self.isolation is None:
             return None
         return IsolationLimits(timeout_s=self.input_timeout_s, memory_bytes=READING_MEMORY_BYTES)
+
+
+def resources_of(given: Mapping[str, Any], **further: Any) -> Resources:
+    """The resources of some options, of `ResourceOptions`; `further` fields are no options.
+
+    Raises SettingsError if a limit is too small, or a certificate cannot be used.
+    """
+    values = values_of(ResourceOptions, given)
+    tls = [values.pop(f"tls_{name}", None) for name in ("ca", "cert", "key")]
+    if any(tls) or any(name.startswith("GABLEWORK_TLS_") for name in os.environ):
+        from pipeline.runtime.cluster.tls import given_tls
+
+        further["tls"] = given_tls(*tls)
+    if "building_memory_gib" in values:
+        values["building_memory_bytes"] = round(values.pop("building_memory_gib") * 2**30)
+    return Resources(**values, **further)
 
 
 SERIAL = Resources(workers=0)

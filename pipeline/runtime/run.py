@@ -13,6 +13,7 @@ from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING
 
 from pipeline.io import storage_at
+from pipeline.registry import extra
 from pipeline.runtime.cluster.serial_executor import Executor
 from pipeline.runtime.isolation.preloading import loads_of
 from pipeline.runtime.manifest import RunStatus
@@ -41,11 +42,11 @@ from pipeline.terrain.flight_passes import Strip
 from pipeline.tiling import MM
 
 if TYPE_CHECKING:
+    from pipeline.extras.footprints.given_footprints import GivenFootprints
+    from pipeline.extras.guides.given_guides import GivenGuides
+    from pipeline.extras.overrides.overrides_file import Override
+    from pipeline.extras.terrain_tin.terrain_output import TerrainOutcome
     from pipeline.runtime.expected import Expected
-    from pipeline.runtime.overrides.overrides_file import Override
-    from pipeline.runtime.stages.given_footprints import GivenFootprints
-    from pipeline.runtime.stages.given_guides import GivenGuides
-    from pipeline.runtime.stages.terrain import TerrainOutcome
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -272,9 +273,7 @@ def find_candidates(context: RunContext, begun: Begun) -> Candidates:
     if headline := about_emptiness(inputs.ingested, ground, joined, trust=settings.general.classes == "trust"):
         context.progress.warn_first("join", headline)
     if begun.request.overrides is not None:
-        from pipeline.runtime.stages.apply_overrides import overridden
-
-        joined, entries = overridden(context, settings, joined, begun.overrides, inputs.ingested, ground)
+        joined, entries = extra("overridden")(context, settings, joined, begun.overrides, inputs.ingested, ground)
         for one in begun.directories:
             one.put_overrides(entries)
     return Candidates(ingested=inputs.ingested, moves_mm=inputs.moves_mm, ground=ground, splits=splits, joined=joined)
@@ -308,16 +307,12 @@ def publish_models(
     published = publish(context, settings, found.splits, found.joined, models, output)
     without_points: tuple[str, ...] = ()
     if request.points:
-        from pipeline.runtime.stages.points import PointsOutput, write_points  # loads kernels, which few drivers need
-
         given = request.footprints is not None
-        points = PointsOutput(run_dir=run_dir, splits=found.splits, ingested=found.ingested, given=given)
-        without_points = write_points(context, settings, found.joined, models, points)
+        points = extra("PointsOutput")(run_dir=run_dir, splits=found.splits, ingested=found.ingested, given=given)
+        without_points = extra("write_points")(context, settings, found.joined, models, points)
     terrain: TerrainOutcome | None = None
     if settings.general.terrain != "none":
-        from pipeline.runtime.stages.terrain import write_terrain  # likewise
-
-        terrain = write_terrain(context, settings, found.ground, models, run_dir, request.meshes)
+        terrain = extra("write_terrain")(context, settings, found.ground, models, run_dir, request.meshes)
     started = time.perf_counter()
     digest = _digest(context, found.joined, models, published, run_dir)
     context.progress.timings[DIGEST] = time.perf_counter() - started

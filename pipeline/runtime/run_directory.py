@@ -35,9 +35,9 @@ from pipeline.settings import RunSettings
 from pipeline.tiling import MM
 
 if TYPE_CHECKING:
-    from pipeline.runtime.stages.apply_overrides import EntryOutcome
-    from pipeline.runtime.stages.given_footprints import GivenFootprints
-    from pipeline.runtime.stages.given_guides import GivenGuides
+    from pipeline.extras.footprints.given_footprints import GivenFootprints
+    from pipeline.extras.guides.given_guides import GivenGuides
+    from pipeline.extras.overrides.apply_overrides import EntryOutcome
 
 FOOTPRINTS = "footprints.json"
 """File of the run directory with the faults of the given footprints, one by one."""

@@ -1,7 +1,7 @@
 """The scheduler of batches and of the service: cron times, decisions, state, history. Pure; time is an argument."""
 
 from pipeline.schedule.cron import Cron
-from pipeline.schedule.decisions import Decision, Missed, Overlap, Rules, decide
+from pipeline.schedule.rules import Missed, Overlap, Rules
 from pipeline.schedule.slots import PassedSlots, passed_slots
 from pipeline.schedule.state import (
     PUT_BACK,
@@ -22,7 +22,6 @@ from pipeline.schedule.time_zones import time_zone
 __all__ = [
     "PUT_BACK",
     "Cron",
-    "Decision",
     "Entry",
     "Look",
     "Missed",
@@ -32,7 +31,6 @@ __all__ = [
     "Rules",
     "ScheduleBook",
     "ScheduleState",
-    "decide",
     "decided_by",
     "enter",
     "look",

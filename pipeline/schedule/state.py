@@ -11,7 +11,7 @@ from collections.abc import Callable
 from enum import StrEnum
 from typing import Protocol
 
-from pipeline.schedule.decisions import Rules, decide
+from pipeline.schedule.rules import Missed, Overlap, Rules
 from pipeline.schedule.slots import PassedSlots, passed_slots
 
 PUT_BACK = dt.timedelta(minutes=10)
@@ -128,7 +128,9 @@ def look(
     under_way: str | None,
     has_run: Callable[[dt.datetime], bool] = lambda _slot: False,
 ) -> Look:
-    """Decide all slots that have passed.
+    """Decide all slots that have passed: the latest one is run, waits, is skipped or missed, those before are missed.
+
+    Two runs of one schedule never overlap, whatever its rules are.
 
     Parameters
     ----------
@@ -136,34 +138,51 @@ def look(
         The run of this schedule that is under way, in words for the history; None if there is none.
     has_run : callable
         Whether a slot had its run already: it may come again after the clock was put back.
+
+    >>> from pipeline.schedule import Cron
+    >>> state = ScheduleState(decided_until=dt.datetime(2026, 1, 1, tzinfo=dt.UTC))
+    >>> hourly = Rules(cron=Cron("@hourly", "UTC"), missed=Missed.SKIP, overlap=Overlap.WAIT)
+    >>> on_time = state.decided_until + dt.timedelta(hours=1)
+    >>> look(state, hourly, on_time, under_way=None).due == on_time
+    True
+    >>> look(state, hourly, on_time, under_way="a run").state.waiting == on_time
+    True
+    >>> look(state, hourly, on_time + dt.timedelta(minutes=30), under_way=None).entries[0].outcome.value
+    'missed'
     """
     decided_until = decided_by(state, now)
     if rules.is_paused:
         found = miss_waiting(state, now, "the schedule was paused while it waited")
         return dataclasses.replace(found, state=ScheduleState(decided_until=decided_until))
     passed = passed_slots(rules.cron, state.decided_until, now)
+    slot, waiting = None if passed is None else passed.latest, state.waiting
+    again = slot is not None and has_run(slot)
+    is_late = slot is not None and not again and rules.missed is Missed.SKIP and _seconds(slot, now) > rules.grace_s
     entries = [_note_put_back(state, now)] if was_put_back(state, now) else []
-    again = None if passed is None or not has_run(passed.latest) else passed.latest
-    undecided = passed if again is None else None
-    decision = decide(undecided, rules, waiting=state.waiting, is_busy=under_way is not None, now=now)
-    if passed is not None and (decision.late is not None or passed.earlier):
-        fate = "only the latest of them counts" if decision.late is None else f"seen later than {rules.grace_s:g} s"
+    if passed is not None and (is_late or passed.earlier):
+        fate = f"seen later than {rules.grace_s:g} s" if is_late else "only the latest of them counts"
         message = f"the clock was not looked at from {utc(passed.first or passed.latest)} to {utc(now)}: {fate}"
-        entries.append(_missed_together(passed, now, message, with_latest=decision.late is not None))
-    if again is not None:
+        entries.append(_missed_together(passed, now, message, with_latest=is_late))
+    if again:
         message = "it had its run before the clock was put back"
-        entries.append(Entry(outcome=Outcome.SKIPPED, slot=again, at=now, message=message))
-    if decision.replaced is not None:
-        message = "a later slot took its place while it waited"
-        entries.append(Entry(outcome=Outcome.MISSED, slot=decision.replaced, at=now, message=message))
-    if decision.skipped is not None:
-        message = f"{under_way} was still under way"
-        entries.append(Entry(outcome=Outcome.SKIPPED, slot=decision.skipped, at=now, message=message))
-    if decision.waits != state.waiting and decision.waits is not None:
-        message = f"waits until {under_way} is over"
-        entries.append(Entry(outcome=Outcome.WAITING, slot=decision.waits, at=now, message=message))
-    after = ScheduleState(decided_until=decided_until, waiting=decision.waits)
-    return Look(state=after, entries=tuple(entries), due=decision.run)
+        entries.append(Entry(outcome=Outcome.SKIPPED, slot=slot, at=now, message=message))
+    elif slot is not None and not is_late:
+        if under_way is not None and rules.overlap is Overlap.SKIP:
+            message = f"{under_way} was still under way"
+            entries.append(Entry(outcome=Outcome.SKIPPED, slot=slot, at=now, message=message))
+        else:
+            entries += miss_waiting(state, now, "a later slot took its place while it waited").entries
+            waiting = slot
+    if under_way is None:
+        return Look(state=ScheduleState(decided_until=decided_until), entries=tuple(entries), due=waiting)
+    if waiting != state.waiting:
+        entries.append(Entry(outcome=Outcome.WAITING, slot=waiting, at=now, message=f"waits until {under_way} is over"))
+    return Look(state=ScheduleState(decided_until=decided_until, waiting=waiting), entries=tuple(entries))
+
+
+def _seconds(slot: dt.datetime, now: dt.datetime) -> float:
+    """How long ago a slot was, by time and not by the wall: clocks are shifted."""
+    return (now.astimezone(dt.UTC) - slot.astimezone(dt.UTC)).total_seconds()
 
 
 def _note_put_back(state: ScheduleState, now: dt.datetime) -> Entry:

@@ -35,7 +35,7 @@ class GroundFilter(NamedTuple):
 
 FILTERS = {
     "morphological": GroundFilter("pipeline.terrain.morphological:found_ground", 150, True),
-    "hierarchical": GroundFilter("pipeline.terrain.hierarchical_filter:found_ground", 210, False),
+    "hierarchical": GroundFilter("pipeline.extras.hierarchical_filter.hierarchical_filter:found_ground", 210, False),
 }
 """The ground filters by name: 144 and 207 bytes per cell were measured."""
 

@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 import ssl
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Iterator
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Concatenate, ParamSpec, Self, TypeVar
 
 import httpx
 
 from pipeline.errors import SettingsError
-from service.client.answers import Event, FetchedFile, Job, Output, Submitted
+from service.client.answers import Event
 from service.client.attempts import PATIENCE_S
-from service.client.operations import JobRef, OnEvent, Operations, Paths, ignore
+from service.client.operations import JobRef, Operations
 from service.client.session import Notify, Session, service_key, service_url
 from service.client.transport import AsyncTransport, BlockingTransport, finished
 from service.client.upload_memory import UploadMemory
-from service.client.uploads import OnTransfer
+
+Given = ParamSpec("Given")
+Result = TypeVar("Result")
 
 _log = logging.getLogger("gablework.client")
 
@@ -81,6 +84,18 @@ class AsyncClient(Operations):
         await self.close()
 
 
+def _blocking(
+    operation: Callable[Concatenate[Operations, Given], Coroutine[Any, Any, Result]],
+) -> Callable[Concatenate[Client, Given], Result]:
+    """The method of `Client` that runs an operation to its end."""
+
+    def method(client: Client, /, *given: Given.args, **named: Given.kwargs) -> Result:
+        return finished(operation(client.operations, *given, **named))
+
+    functools.update_wrapper(method, operation)
+    return method
+
+
 class Client:
     """A client of the service that blocks; its parameters, methods and errors are those of `AsyncClient`.
 
@@ -108,7 +123,8 @@ class Client:
             patience_s=patience_s,
             notify=notify or _log.warning,
         )
-        self._operations = Operations(session, memory or UploadMemory.of_user())
+        self.operations = Operations(session, memory or UploadMemory.of_user())
+        """The same methods as coroutines, which never suspend."""
 
     def __enter__(self) -> Self:
         """The client."""
@@ -120,78 +136,24 @@ class Client:
         """End all connections."""
         self.close()
 
-    def upload(self, path: str | Path, *, on_transfer: OnTransfer = ignore) -> str:
-        """Send a file; the id of its upload. A call that was interrupted continues; a file is sent once."""
-        return finished(self._operations.upload(path, on_transfer=on_transfer))
-
-    def submit(
-        self,
-        tiles: Paths,
-        *,
-        process: str = "reconstruct",
-        footprints: str | Path | None = None,
-        guides: str | Path | None = None,
-        outputs: Sequence[str] | None = None,
-        new: bool = False,
-        on_transfer: OnTransfer = ignore,
-        **inputs: Any,
-    ) -> Job:
-        """Send tiles and start a job with them; the job. See `AsyncClient.submit`."""
-        return self.submission(
-            tiles,
-            process=process,
-            inputs=inputs,
-            footprints=footprints,
-            guides=guides,
-            outputs=outputs,
-            new=new,
-            on_transfer=on_transfer,
-        ).job
-
-    def submission(
-        self,
-        tiles: Paths,
-        *,
-        process: str,
-        inputs: Mapping[str, Any],
-        footprints: str | Path | None = None,
-        guides: str | Path | None = None,
-        outputs: Sequence[str] | None = None,
-        new: bool = False,
-        on_transfer: OnTransfer = ignore,
-    ) -> Submitted:
-        """As `submit`; the job, and whether this call has made it."""
-        return finished(
-            self._operations.submission(
-                tiles,
-                process=process,
-                inputs=inputs,
-                footprints=footprints,
-                guides=guides,
-                outputs=outputs,
-                new=new,
-                on_transfer=on_transfer,
-            )
-        )
-
-    def job(self, job: JobRef) -> Job:
-        """The job as it is now."""
-        return finished(self._operations.job(job))
-
-    def jobs(
-        self,
-        *,
-        status: str | Sequence[str] | None = None,
-        process: str | Sequence[str] | None = None,
-        limit: int = 100,
-        offset: int = 0,
-    ) -> list[Job]:
-        """A page of the jobs that the key may see, newest first."""
-        return finished(self._operations.jobs(status=status, process=process, limit=limit, offset=offset))
+    upload = _blocking(Operations.upload)
+    submit = _blocking(Operations.submit)
+    submission = _blocking(Operations.submission)
+    job = _blocking(Operations.job)
+    jobs = _blocking(Operations.jobs)
+    wait = _blocking(Operations.wait)
+    cancel = _blocking(Operations.cancel)
+    retry = _blocking(Operations.retry)
+    keep = _blocking(Operations.keep)
+    remove = _blocking(Operations.remove)
+    results = _blocking(Operations.results)
+    fetch = _blocking(Operations.fetch)
+    request = _blocking(Operations.request)
+    close = _blocking(Operations.close)
 
     def watch(self, job: JobRef, *, after: int = 0) -> Iterator[Event]:
         """The events of a job as they come, to its end."""
-        events = self._operations.watch(job, after=after)
+        events = self.operations.watch(job, after=after)
         try:
             while True:
                 try:
@@ -201,59 +163,6 @@ class Client:
                 yield event
         finally:
             finished(events.aclose())
-
-    def wait(self, job: JobRef, *, on_event: OnEvent = ignore) -> Job:
-        """The job once it has succeeded; raises if it ended otherwise."""
-        return finished(self._operations.wait(job, on_event=on_event))
-
-    def cancel(self, job: JobRef) -> Job:
-        """Stop a job that waits or runs; one that is over stays as it is."""
-        return finished(self._operations.cancel(job))
-
-    def retry(self, job: JobRef, *, outputs: Sequence[str] | None = None, **inputs: Any) -> Job:
-        """A new job with the request of one that is over; inputs replace those of the old one, None takes one away."""
-        return finished(self._operations.retry(job, outputs=outputs, **inputs))
-
-    def keep(self, job: JobRef, *, keep: bool = True) -> Job:
-        """Keep a job with its results, whatever its age and size, or no longer."""
-        return finished(self._operations.keep(job, keep=keep))
-
-    def remove(self, job: JobRef) -> None:
-        """Remove a job that is over, with its results."""
-        finished(self._operations.remove(job))
-
-    def results(self, job: JobRef, *, method: str | None = None, status: Sequence[str] = ()) -> list[Output]:
-        """The outputs of a job that succeeded; also those of one method, or with buildings of some statuses only."""
-        return finished(self._operations.results(job, method=method, status=status))
-
-    def fetch(
-        self,
-        job: JobRef,
-        out: str | Path,
-        kinds: Sequence[str] = (),
-        *,
-        method: str | None = None,
-        status: Sequence[str] = (),
-        overwrite: bool = False,
-        on_transfer: OnTransfer = ignore,
-    ) -> list[FetchedFile]:
-        """Fetch outputs into a folder, all or those of some kinds. A call that was interrupted continues.
-
-        With `status` such as `["ok"]` they hold only buildings of these statuses.
-        """
-        return finished(
-            self._operations.fetch(
-                job, out, kinds, method=method, status=status, overwrite=overwrite, on_transfer=on_transfer
-            )
-        )
-
-    def request(self, method: str, path: str, *, params: Mapping[str, Any] | None = None, document: Any = None) -> Any:
-        """Any other request: the document that is answered, or the bytes if it is not JSON; None without content."""
-        return finished(self._operations.request(method, path, params=params, document=document))
-
-    def close(self) -> None:
-        """End all connections."""
-        finished(self._operations.close())
 
 
 def _trusted(url: str, ca: str | Path | None) -> ssl.SSLContext:

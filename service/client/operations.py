@@ -59,6 +59,7 @@ class Operations:
 
     async def submit(
         self,
+        /,
         tiles: Paths,
         *,
         process: str = "reconstruct",
@@ -212,7 +213,7 @@ class Operations:
                 return self._job(self._session.document(answer))
             await self._session.after_refusal(answer, attempts)
 
-    async def retry(self, job: JobRef, *, outputs: Sequence[str] | None = None, **inputs: Any) -> Job:
+    async def retry(self, /, job: JobRef, *, outputs: Sequence[str] | None = None, **inputs: Any) -> Job:
         """A new job with the request of one that is over; inputs replace those of the old one, None takes one away."""
         body: dict[str, Any] = {"inputs": inputs} if inputs else {}
         if outputs is not None:

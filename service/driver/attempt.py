@@ -15,14 +15,15 @@ from typing import Any, Protocol, TypeVar
 
 from pipeline import __version__
 from pipeline.errors import GableworkError, RunCancelledError
-from pipeline.runtime.classify import ClassifyRequest, ClassifySummary, classify
+from pipeline.extras.classify.classify import ClassifyRequest, classify
+from pipeline.extras.compare.compare import CompareRequest, CompareSummary, own_tables, parse_variants
+from pipeline.options import InputOptions, ModelOptions, values_of
 from pipeline.runtime.cluster.serial_executor import Executor
-from pipeline.runtime.compare import CompareRequest, CompareSummary, own_tables, parse_variants
 from pipeline.runtime.monitoring import tracing
 from pipeline.runtime.monitoring.progress import Event, Listener
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.resources import Resources
-from pipeline.runtime.run import RunSummary, run
+from pipeline.runtime.run import run
 from pipeline.runtime.scratch.location import SCRATCH
 from pipeline.settings import RunSettings
 from service.disk import has_no_space
@@ -55,128 +56,17 @@ _NAMED = 10
 """Inputs that the log of a job names."""
 
 
-class Run(Protocol):
-    """`pipeline.runtime.run.run`."""
-
-    def __call__(
-        self, request: RunRequest, on_event: Listener, executor: Executor | None, cancelled: Callable[[], bool]
-    ) -> RunSummary:
-        """Reconstruct all buildings."""
-
-
-class Compare(Protocol):
-    """`compare` of this module."""
-
-    def __call__(
-        self, request: CompareRequest, on_event: Listener, executor: Executor | None, cancelled: Callable[[], bool]
-    ) -> CompareSummary:
-        """Run several methods on the same candidates and write the comparison."""
-
-
-class Classify(Protocol):
-    """`pipeline.runtime.classify.classify`."""
-
-    def __call__(
-        self, request: ClassifyRequest, on_event: Listener, executor: Executor | None, cancelled: Callable[[], bool]
-    ) -> ClassifySummary:
-        """Classify all points."""
-
-
-class Gather(Protocol):
-    """`service.fetching.gather`."""
-
-    def __call__(
-        self,
-        request: JobRequest,
-        *,
-        store: UploadTable,
-        folder: StateFolder,
-        settings: ServiceSettings,
-        target: Path,
-        cancelled: Callable[[], bool],
-        progress: Callable[[int], None],
-    ) -> JobFiles:
-        """Fetch all inputs to this machine's disk."""
-
-
-class WriteOutputs(Protocol):
-    """`service.outputs.write_outputs`."""
-
-    def __call__(
-        self, run_dir: Path, out_dir: Path, wanted: Sequence[str] | None, on_progress: Callable[[int, int], None]
-    ) -> None:
-        """Assemble the outputs."""
-
-
-class Publish(Protocol):
-    """`service.outputs.published.publish`."""
-
-    def __call__(
-        self,
-        run_dir: Path,
-        out_dir: Path,
-        formats: Sequence[str],
-        *,
-        name: str,
-        geoid_height_m: float | None,
-        on_progress: Callable[[int, int], None],
-    ) -> Mapping[str, Exception]:
-        """Write further formats; returns why some could not be made."""
-
-
-class WriteComparison(Protocol):
-    """`service.outputs.write_comparison_outputs`."""
-
-    def __call__(
-        self,
-        folder: Path,
-        labels: Sequence[str],
-        out_dir: Path,
-        wanted: Sequence[str] | None,
-        on_progress: Callable[[int, int], None],
-    ) -> None:
-        """Assemble the outputs of a comparison."""
-
-
 def compare(
     request: CompareRequest, on_event: Listener, executor: Executor | None, cancelled: Callable[[], bool]
 ) -> CompareSummary:
-    """`report.compare_files.compare_files` without a reference; imported late: it loads matplotlib."""
-    from pipeline.ruler.report.compare_files import compare_files
+    """`report.comparison.compare_files` without a reference; imported late: it loads matplotlib."""
+    from pipeline.ruler.report.comparison import compare_files
 
     return compare_files(request, on_event=on_event, executor=executor, cancelled=cancelled).summary
 
 
-class WriteClassification(Protocol):
-    """`service.outputs.write_classification_outputs`."""
-
-    def __call__(
-        self,
-        summary: ClassifySummary,
-        out_dir: Path,
-        wanted: Sequence[str] | None,
-        on_progress: Callable[[int, int], None],
-        scrub: Callable[[str], str],
-    ) -> None:
-        """Assemble the outputs of a classification."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Tools:
-    """The steps of an attempt; tests replace them."""
-
-    gather: Gather = gather
-    run: Run = run
-    compare: Compare = compare
-    classify: Classify = classify
-    publish: Publish = publish
-    write_outputs: WriteOutputs = write_outputs
-    write_comparison: WriteComparison = write_comparison_outputs
-    write_classification: WriteClassification = write_classification_outputs
-
-
 class Held(Protocol):
-    """The job, for the work on it: `Held` in the driver, `ChildJob` in the process of an attempt."""
+    """The job, for the work on it: `ChildJob` in the process of an attempt, `LeasedJob` in the tests of this module."""
 
     job: Job
     scrub: Scrubber
@@ -201,16 +91,9 @@ class Held(Protocol):
         """Add a line to the job's log."""
 
 
-class Workers(Protocol):
-    """`SharedCluster`, or what stands for it in the process of an attempt."""
-
-    def executor(self, held: Any) -> Executor:
-        """An executor for the run of a job, as soon as there are workers."""
-
-
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class AttemptParts:
-    """What the work on a job needs beside the job."""
+    """What the work on a job needs beside the job; its steps are functions of this module, which tests replace."""
 
     settings: ServiceSettings
     folder: StateFolder
@@ -218,8 +101,8 @@ class AttemptParts:
     """The folder in which the attempt works."""
     uploads: UploadTable
     """Knows the uploads of the job."""
-    workers: Workers
-    tools: Tools = Tools()
+    executor: Callable[[], Executor]
+    """An executor for the run of the job, as soon as there are workers."""
 
     @property
     def inputs(self) -> Path:
@@ -302,7 +185,7 @@ def perform(held: Held, parts: AttemptParts) -> tuple[str, dict[str, Any]]:
         scrub.name(str(fetched.path), fetched.path.name)
     _note_inputs(held, files.tiles)
     work = begin(held, parts, files)
-    executor = parts.workers.executor(held)
+    executor = parts.executor()
     held.record(Event(kind="stage", stage="plan"))
     done = work(executor)
     _check(held)
@@ -317,7 +200,7 @@ def _gathered(held: Held, parts: AttemptParts) -> JobFiles:
     if before is not None:
         return before
     shutil.rmtree(parts.inputs, ignore_errors=True)
-    files = parts.tools.gather(
+    files = gather(
         held.job.request,
         store=parts.uploads,
         folder=parts.folder,
@@ -350,12 +233,12 @@ def _reconstruct(held: Held, parts: AttemptParts, files: JobFiles) -> _Work:
     request = run_request(job.request, files, parts.run, parts.settings)
 
     def work(executor: Executor) -> tuple[str, dict[str, Any]]:
-        summary = parts.once("run", lambda: parts.tools.run(request, held.record, executor, held.cancelled))
+        summary = parts.once("run", lambda: run(request, held.record, executor, held.cancelled))
         parts.clear_scratch()
         problems = parts.once("formats", lambda: _published(held, parts))
         begin = _begun(held, "outputs")
         with tracing.span("stage outputs", stage="outputs"):
-            parts.tools.write_outputs(Path(request.out), out_dir, job.request.outputs, begin)
+            write_outputs(Path(request.out), out_dir, job.request.outputs, begin)
         found = digest_of(summary, held.scrub, __version__) | ({"unpublished": problems} if problems else {})
         return outcome(summary, problems), found
 
@@ -372,7 +255,7 @@ def _published(held: Held, parts: AttemptParts) -> dict[str, str]:
     on_progress = _begun(held, "formats")
     held.scrub.name(str(parts.run), "this job")
     with tracing.span("stage formats", stage="formats"):
-        found = parts.tools.publish(
+        found = publish(
             parts.run,
             parts.outputs,
             request.publish,
@@ -400,12 +283,12 @@ def _compare(held: Held, parts: AttemptParts, files: JobFiles) -> _Work:
     request = compare_request(job.request, files, place, parts.settings)
 
     def work(executor: Executor) -> tuple[str, dict[str, Any]]:
-        summary = parts.once("compare", lambda: parts.tools.compare(request, held.record, executor, held.cancelled))
+        summary = parts.once("compare", lambda: compare(request, held.record, executor, held.cancelled))
         parts.clear_scratch()
         shutil.rmtree(out_dir, ignore_errors=True)
         begin = _begun(held, "outputs")
         with tracing.span("stage outputs", stage="outputs"):
-            parts.tools.write_comparison(place, list(summary.runs), out_dir, job.request.outputs, begin)
+            write_comparison_outputs(place, list(summary.runs), out_dir, job.request.outputs, begin)
         return comparison_outcome(summary), comparison_digest(summary, held.scrub, __version__)
 
     return work
@@ -417,12 +300,12 @@ def _classify(held: Held, parts: AttemptParts, files: JobFiles) -> _Work:
     request = classify_request(job.request, files, parts.run, parts.settings)
 
     def work(executor: Executor) -> tuple[str, dict[str, Any]]:
-        summary = parts.once("classify", lambda: parts.tools.classify(request, held.record, executor, held.cancelled))
+        summary = parts.once("classify", lambda: classify(request, held.record, executor, held.cancelled))
         parts.clear_scratch()
         shutil.rmtree(out_dir, ignore_errors=True)
         begin = _begun(held, "outputs")
         with tracing.span("stage outputs", stage="outputs"):
-            parts.tools.write_classification(summary, out_dir, job.request.outputs, begin, held.scrub)
+            write_classification_outputs(summary, out_dir, job.request.outputs, begin, held.scrub)
         return classification_outcome(summary), classification_digest(summary, held.scrub, __version__)
 
     return work
@@ -477,18 +360,11 @@ def run_request(request: JobRequest, files: JobFiles, out: Path, settings: Servi
         out=str(out),
         settings=RunSettings.from_mapping(request.settings),
         footprints=None if files.footprints is None else str(files.footprints.path),
-        footprints_layer=request.footprints_layer,
         guides=None if files.guides is None else str(files.guides.path),
-        crs=request.crs,
-        vertical_unit=request.vertical_unit,
-        allow_outside_area_of_use=request.allow_outside_area_of_use,
-        bbox=request.bbox,
         resources=_resources(settings),
         # an attempt that was handed back may have begun it; the folder is the attempt's own
         overwrite=True,
-        meshes=request.meshes,
-        points=request.points,
-        licence=request.licence,
+        **values_of(ModelOptions, request),
     )
 
 
@@ -527,15 +403,12 @@ def classify_request(request: JobRequest, files: JobFiles, out: Path, settings: 
         out=str(out),
         settings=RunSettings.from_mapping(request.settings),
         footprints=None if files.footprints is None else str(files.footprints.path),
-        footprints_layer=request.footprints_layer,
-        crs=request.crs,
-        vertical_unit=request.vertical_unit,
-        allow_outside_area_of_use=request.allow_outside_area_of_use,
         rasters=has_rasters,
         raster_cell=request.raster_cell if has_rasters else None,
         resources=_resources(settings),
         # files of an attempt that was handed back
         overwrite=True,
+        **values_of(InputOptions, request),
     )
 
 

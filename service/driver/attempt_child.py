@@ -18,7 +18,6 @@ from typing import Any, Self
 from pipeline.errors import ClusterError, GableworkError
 from pipeline.io.reading import seen_by
 from pipeline.runtime.cluster.dask_executor import Cluster, load_dask
-from pipeline.runtime.cluster.serial_executor import Executor
 from pipeline.runtime.isolation import child_main
 from pipeline.runtime.isolation.progress_reports import report_progress
 from pipeline.runtime.monitoring import tracing
@@ -219,26 +218,13 @@ class LentCluster(Cluster):
             child_main.say(WorkersMissing(workers))
 
 
-class _DriversWorkers:
-    """Stands for `SharedCluster` in this process."""
-
-    def __init__(self, settings: ServiceSettings) -> None:
-        self._settings = settings
-
-    def executor(self, held: ChildJob) -> Executor:
-        """An executor for the run of the job, as soon as the driver has workers."""
-        # jobs are interactive: they go before batch runs on the same scheduler
-        return LentCluster(held.lent(), self._settings).executor(held.job.priority)
-
-
 def load() -> None:
     """Load what an attempt needs, before the process is forked; nothing here may start a thread."""
     import pyarrow.compute
     import pyarrow.parquet
     import pyproj
 
-    import service.outputs.building_index
-    import service.outputs.footprints
+    import service.features.writing
     import service.outputs.merged_cityjson
     import service.outputs.merged_table
     import service.outputs.report  # noqa: F401
@@ -275,7 +261,8 @@ def _attended(held: ChildJob, order: Order) -> tuple[str, dict[str, Any]]:
         folder=StateFolder(order.settings.state.resolve(), order.settings.reserve_bytes),
         place=order.place,
         uploads=KnownUploads(order.uploads),
-        workers=_DriversWorkers(order.settings),
+        # jobs are interactive: they go before batch runs on the same scheduler
+        executor=lambda: LentCluster(held.lent(), order.settings).executor(order.job.priority),
     )
     try:
         with traces.attempt(order.job, order.driver), seen_by(report_progress):

@@ -14,7 +14,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from pipeline.errors import RunCancelledError, RunError
 from pipeline.io.temporary import remove_left_folders
@@ -23,9 +23,7 @@ from pipeline.runtime.isolation.messages import Finished, OutOfMemory, Progresse
 from pipeline.runtime.isolation.supervision import SupervisedChild, system_kills
 from pipeline.runtime.monitoring.progress import Event
 from pipeline.runtime.scratch.folder import PULSE
-from service import traces
 from service.disk import has_no_space
-from service.driver.attempt import AttemptParts, Tools, perform
 from service.driver.attempt_child import (
     LOADS,
     End,
@@ -73,60 +71,12 @@ class DriverParts:
     cluster: SharedCluster
 
 
-class Perform(Protocol):
-    """Does the work of an attempt; `InOwnProcess`, or `InThisProcess` in tests."""
-
-    def __call__(self, held: LeasedJob, place: Path) -> tuple[str, dict[str, Any]]:
-        """As `service.driver.attempt.perform`, in the folder `place`."""
-
-    def preload(self) -> None:
-        """Get ready for the first attempt."""
-
-    def wait_until_ready(self) -> None:
-        """Wait until most attempts find all that they need."""
-
-    def close(self) -> None:
-        """End all processes."""
-
-
-class InThisProcess:
-    """Attempts in the driver's own threads, where tests replace their steps."""
-
-    def __init__(self, shop: DriverParts, name: str, tools: Tools) -> None:
-        self._shop = shop
-        self._name = name
-        self._tools = tools
-
-    def preload(self) -> None:
-        """Everything is there."""
-
-    def wait_until_ready(self) -> None:
-        """Everything is there."""
-
-    def __call__(self, held: LeasedJob, place: Path) -> tuple[str, dict[str, Any]]:
-        """As `service.driver.attempt.perform`."""
-        shop = self._shop
-        parts = AttemptParts(
-            settings=shop.settings,
-            folder=shop.folder,
-            place=place,
-            uploads=shop.store,
-            workers=shop.cluster,
-            tools=self._tools,
-        )
-        with traces.attempt(held.job, self._name):
-            return perform(held, parts)
-
-    def close(self) -> None:
-        """Nothing to end."""
-
-
 class InOwnProcess:
     """Attempts in processes of their own.
 
     Parameters
     ----------
-    shop : DriverParts
+    parts : DriverParts
         Settings, folder, store, cluster.
     name : str
         Name of the driver.
@@ -138,16 +88,16 @@ class InOwnProcess:
 
     def __init__(
         self,
-        shop: DriverParts,
+        parts: DriverParts,
         name: str,
         work: Callable[[Order], tuple[str, dict[str, Any]]] = attend,
         kernels: Kernels | None = None,
     ) -> None:
-        self._shop = shop
+        self._parts = parts
         self._name = name
         self._work = work
         self._pool = ChildPool(stderr=sys.stderr.fileno())
-        self._kernels = kernels or Kernels(compiles=shop.settings.scheduler is None)
+        self._kernels = kernels or Kernels(compiles=parts.settings.scheduler is None)
 
     def preload(self) -> None:
         """Start the process from which attempts are forked, and the compilation of kernels."""
@@ -176,9 +126,9 @@ class InOwnProcess:
         self._kernels.wait_for(held)
         order = Order(
             job=held.job,
-            settings=self._shop.settings,
+            settings=self._parts.settings,
             place=place,
-            uploads=_uploads(self._shop.store, held),
+            uploads=_uploads(self._parts.store, held),
             driver=self._name,
         )
         # what befell an attempt may come from those before it in its process
@@ -197,7 +147,7 @@ class InOwnProcess:
                     f"this machine has no room for its process now ({type(error).__name__})"
                 ) from error
             # the pool ends a child that an error leaves
-            done = _Attended(held, child, order, self._shop.cluster).result(self._work)
+            done = _Attended(held, child, order, self._parts.cluster).result(self._work)
             if is_retry or held.cancelled() or _is_worn(child, order.settings.attempt_memory_bytes):
                 child.end()
             return done

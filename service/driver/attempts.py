@@ -16,10 +16,10 @@ from pipeline.errors import ClusterError, GableworkError, RunCancelledError
 from service import traces
 from service.disk import FULL_BYTES, has_no_space
 from service.driver import workplace
-from service.driver.attempt_process import DriverParts, Perform
+from service.driver.attempt_process import DriverParts, InOwnProcess
 from service.driver.failures import failure_of, is_tried_again
-from service.driver.finished_work import leave, take_over
 from service.driver.leased_job import LOG, LeasedJob, Stop
+from service.driver.loops import DATABASE
 from service.driver.so_far import shown_while_watched
 from service.errors import (
     AttemptEndedError,
@@ -33,8 +33,6 @@ from service.errors import (
 from service.jobs import EndedAttempt, JobStatus, LogLevel
 from service.store.policies import after_end
 
-DATABASE = Backoff(first_s=0.5, longest_s=15.0)
-"""Pauses between tries to reach the database."""
 LOST_CLUSTER = Backoff(first_s=2.0, longest_s=60.0)
 """Pauses until a job whose cluster was lost is tried again."""
 NO_SPACE_PAUSE_S = 30.0
@@ -48,9 +46,9 @@ class Attempts:
 
     Parameters
     ----------
-    shop : DriverParts
+    parts : DriverParts
         Store, folder, cluster.
-    perform : Perform
+    perform : InOwnProcess
         Does the work.
     name : str
         Name of the driver, for messages.
@@ -58,8 +56,8 @@ class Attempts:
         Set when the driver ends: it then waits for the database no longer than one more try.
     """
 
-    def __init__(self, shop: DriverParts, perform: Perform, *, name: str, ending: threading.Event) -> None:
-        self._shop = shop
+    def __init__(self, parts: DriverParts, perform: InOwnProcess, *, name: str, ending: threading.Event) -> None:
+        self._parts = parts
         self._perform = perform
         self._name = name
         self._ending = ending
@@ -78,7 +76,7 @@ class Attempts:
             held.end_stage()
             done = self._settle(
                 held,
-                lambda: self._shop.store.succeed(held.job, message=message, summary=summary),
+                lambda: self._parts.store.succeed(held.job, message=message, summary=summary),
                 JobStatus.SUCCESSFUL,
             )
         if done:
@@ -88,16 +86,16 @@ class Attempts:
             self._forget(held)
         else:
             try:
-                leave(self._shop.folder, held.job, message, summary)
+                workplace.leave_end(self._parts.folder, held.job, message, summary)
             except OSError as error:
                 LOG.warning("the job must be run again: %s", error, extra=held.facts)
 
     def _worked(self, held: LeasedJob) -> tuple[str, dict[str, Any]]:
         """The result of the work, whose files are in the attempt's folder."""
-        folder, job = self._shop.folder, held.job
+        folder, job = self._parts.folder, held.job
         if held.cancelled():
             raise RunCancelledError("the job was cancelled")
-        found = take_over(folder, job)
+        found = workplace.take_over_end(folder, job)
         if found is not None:
             return found
         place, is_resumed = workplace.take(folder, job)
@@ -119,7 +117,7 @@ class Attempts:
             LOG.info("the attempt was %s: %s", level, reason.name.lower(), extra=held.facts)
         if reason is Stop.DISMISSED:
             self._forget(held, whole=True)
-            self._settle(held, lambda: self._shop.store.dismissed(job), JobStatus.DISMISSED)
+            self._settle(held, lambda: self._parts.store.dismissed(job), JobStatus.DISMISSED)
             return
         if reason is Stop.NO_SPACE:
             error = NoSpaceError("the disk is full except for its reserve")
@@ -131,7 +129,7 @@ class Attempts:
                 self._forget(held)
             message = f"driver {self._name} ended; the job waits for another" if reason is Stop.RELEASED else ""
             lost = reason is Stop.LOST
-            self._settle(held, lambda: self._shop.store.release(job, lost=lost, message=message), JobStatus.ACCEPTED)
+            self._settle(held, lambda: self._parts.store.release(job, lost=lost, message=message), JobStatus.ACCEPTED)
             return
         elif self._is_full(error):
             error = NoSpaceError(f"the disk is full ({type(error).__name__})")
@@ -148,8 +146,8 @@ class Attempts:
         kind = error.kind if isinstance(error, UnexpectedError) else type(error).__name__
         held.note(f"the attempt failed: {kind} (reference {reference})", level=LogLevel.WARNING)
         if isinstance(error, ClusterError) and held.engine is not None:
-            self._shop.cluster.replace(held.engine)
-        is_again = is_tried_again(error, job, self._shop.settings.max_attempts)
+            self._parts.cluster.replace(held.engine)
+        is_again = is_tried_again(error, job, self._parts.settings.max_attempts)
         if not (is_again and isinstance(error, ClusterError) and self._hand_back(held)):
             self._forget(held)
         if is_again:
@@ -159,16 +157,16 @@ class Attempts:
             lost = isinstance(error, ClusterError | NoSpaceError)
             self._settle(
                 held,
-                lambda: self._shop.store.release(job, lost=lost, message=message, retry_after_s=pause),
+                lambda: self._parts.store.release(job, lost=lost, message=message, retry_after_s=pause),
                 JobStatus.ACCEPTED,
             )
             return
         failure = failure_of(error, scrub=held.scrub, reference=reference, attempts=job.lost_attempts + 1)
-        self._settle(held, lambda: self._shop.store.fail(job, failure), JobStatus.FAILED)
+        self._settle(held, lambda: self._parts.store.fail(job, failure), JobStatus.FAILED)
 
     def _end_by_itself(self, held: LeasedJob, error: AttemptEndedError) -> None:
         """Write the outcome of an attempt whose process ended first: it is tried again, or the job failed."""
-        job, settings = held.job, self._shop.settings
+        job, settings = held.job, self._parts.settings
         LOG.error("the attempt %s at stage %r", error, held.stage, extra=held.facts)
         held.note(f"the attempt {error} at stage {held.stage}", level=LogLevel.ERROR)
         ended = EndedAttempt(stage=held.stage, detail=str(error), is_own=error.is_own)
@@ -180,7 +178,7 @@ class Attempts:
             self._forget(held)
         self._settle(
             held,
-            lambda: self._shop.store.end_attempt(
+            lambda: self._parts.store.end_attempt(
                 job, ended, max_attempts=settings.max_attempts, kept_days=settings.stalled_days
             ),
             status,
@@ -193,7 +191,7 @@ class Attempts:
         message = f"waiting: {error}; tried again in {NO_SPACE_PAUSE_S:g} s"
         self._settle(
             held,
-            lambda: self._shop.store.release(held.job, lost=False, message=message, retry_after_s=NO_SPACE_PAUSE_S),
+            lambda: self._parts.store.release(held.job, lost=False, message=message, retry_after_s=NO_SPACE_PAUSE_S),
             JobStatus.ACCEPTED,
         )
 
@@ -211,13 +209,13 @@ class Attempts:
 
     def _so_far_is_over(self, held: LeasedJob) -> None:
         """Remove the buildings that readers saw so far: those of the next attempt replace them."""
-        shutil.rmtree(self._shop.folder.so_far(held.job.job_id, held.job.attempt), ignore_errors=True)
+        shutil.rmtree(self._parts.folder.so_far(held.job.job_id, held.job.attempt), ignore_errors=True)
 
     def _is_full(self, error: BaseException) -> bool:
         """Whether the full disk is the cause. What a worker met arrives in words, so the disk is looked at, too."""
         if isinstance(error, StoreError):
             return False
-        return has_no_space(error) or self._shop.folder.disk.free_bytes < FULL_BYTES
+        return has_no_space(error) or self._parts.folder.disk.free_bytes < FULL_BYTES
 
     def _settle(self, held: LeasedJob, write: Callable[[], None], status: JobStatus) -> bool | None:
         """Write the outcome of an attempt, as soon as the database answers; False if the lease is lost.
@@ -234,7 +232,7 @@ class Attempts:
                         held.write()
                     write()
                 except LeaseLostError as error:
-                    known = self._shop.store.attempts([held.job.job_id]).get(held.job.job_id)
+                    known = self._parts.store.attempts([held.job.job_id]).get(held.job.job_id)
                     if is_repeated and known is not None and known[0].is_over and known[1] == held.job.attempt:
                         traces.job_ended(held.job, known[0])
                     if known == (status, held.job.attempt):
@@ -254,7 +252,7 @@ class Attempts:
 
     def _forget(self, held: LeasedJob, *, whole: bool = False, before: bool = False) -> None:
         """Remove the folder of this attempt, of the whole job, or of the attempts before this one."""
-        job, folder = held.job, self._shop.folder
+        job, folder = held.job, self._parts.folder
         if whole:
             workplace.discard(folder.job(job.job_id))
         elif before:

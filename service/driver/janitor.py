@@ -10,7 +10,7 @@ import shutil
 import time
 from pathlib import Path
 
-from service.driver import finished_work, workplace
+from service.driver import workplace
 from service.errors import NoSuchJobError, UploadInUseError
 from service.files import StateFolder, is_id
 from service.jobs import JobStatus
@@ -121,7 +121,7 @@ def tidy_jobs(store: JobStore, folder: StateFolder, stalled_days: float = 0.0) -
                 continue
             # results whose end no driver could write yet: the next one does
             is_kept = not status.is_over and (
-                finished_work.is_left(path) or workplace.is_needed(path, attempt, waits=status is JobStatus.ACCEPTED)
+                workplace.has_end(path) or workplace.is_needed(path, attempt, waits=status is JobStatus.ACCEPTED)
             )
             if status is JobStatus.FAILED and workplace.has_kept_inputs(path):
                 is_kept = not _is_old(path, stalled_days * _DAY_S)

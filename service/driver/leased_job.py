@@ -11,9 +11,8 @@ from collections.abc import Callable
 from enum import IntEnum
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Protocol, Self
+from typing import TYPE_CHECKING, Any, Self
 
-from pipeline.runtime.cluster.serial_executor import Executor
 from pipeline.runtime.monitoring.progress import Event
 from service.driver.job_log import AttemptLog
 from service.driver.messages import Scrubber
@@ -21,6 +20,9 @@ from service.driver.progress import CLASSIFY_WEIGHTS, WEIGHTS, WORDS, percent
 from service.errors import LeaseLostError, StoreError
 from service.jobs import Job, JobEvent, LogLevel
 from service.store import JobStore
+
+if TYPE_CHECKING:
+    from pipeline.runtime.cluster.dask_executor import Cluster
 
 LOG = logging.getLogger("gablework.driver")
 
@@ -32,32 +34,6 @@ ABANDON_S = 120.0
 """Seconds after the request to stop from which an attempt that goes on loses its lease; its process is ended before."""
 _MAX_PENDING = 500
 """Maximum number of events that wait while the database does not answer; the oldest are dropped first."""
-
-
-class Engine(Protocol):
-    """`pipeline.runtime.cluster.dask_executor.Cluster`."""
-
-    @property
-    def address(self) -> str:
-        """The scheduler's address."""
-
-    @property
-    def embedded(self) -> bool:
-        """Whether the workers belong to this process."""
-
-    def executor(self, priority: int = 0) -> Executor:
-        """An executor for one run."""
-
-    def mend(self, workers: int) -> None:
-        """Restart embedded workers that were given up, if there are fewer than there should be."""
-
-    def __enter__(self) -> Self:
-        """Start."""
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Stop."""
 
 
 class Stop(IntEnum):
@@ -136,7 +112,7 @@ class LeasedJob:
         self._pulse = threading.Thread(target=self._keep, name=f"lease-{job.job_id[:8]}", daemon=True)
         self.scrub = Scrubber()
         self._log = AttemptLog(self.scrub, WORDS)
-        self.engine: Engine | None = None
+        self.engine: Cluster | None = None
         """The workers that run the attempt; None before it runs."""
         self.place: Path | None = None
         """The folder in which the attempt works; None before it begins."""

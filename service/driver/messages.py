@@ -11,8 +11,8 @@ from pipeline.model import Status
 from service.wording import as_inputs
 
 if TYPE_CHECKING:
-    from pipeline.runtime.classify import ClassifySummary
-    from pipeline.runtime.compare import CompareSummary
+    from pipeline.extras.classify.classify import ClassifySummary
+    from pipeline.extras.compare.compare import CompareSummary
     from pipeline.runtime.run import RunSummary
 
 # two components or more, not within a URL, a fraction or a relative path

@@ -18,12 +18,13 @@ from pipeline.backoff import Pauses
 from pipeline.errors import ClusterError
 from pipeline.io.temporary import remove_left_folders
 from pipeline.schedule import Outcome
-from service.driver.attempt_process import DriverParts, InOwnProcess, Perform
-from service.driver.attempts import DATABASE, Attempts
+from service.driver.attempt_process import DriverParts, InOwnProcess
+from service.driver.attempts import Attempts
 from service.driver.disk_watch import LOOK_S, DiskWatch
 from service.driver.janitor import tidy
 from service.driver.leased_job import LOG, LeasedJob, Stop
 from service.driver.logs import configure, quieten
+from service.driver.loops import DATABASE, repeat
 from service.driver.progress import StepLimits
 from service.driver.shared_cluster import SharedCluster
 from service.driver.webhooks import Sender
@@ -66,7 +67,7 @@ class Driver:
         *,
         name: str | None = None,
         parent_pipe: int | None = None,
-        perform: Callable[[DriverParts, str], Perform] = InOwnProcess,
+        perform: Callable[[DriverParts, str], InOwnProcess] = InOwnProcess,
         cluster: SharedCluster | None = None,
     ) -> None:
         self.name = name or f"{socket.gethostname()}-{os.getpid()}-{secrets.token_hex(3)}"
@@ -75,14 +76,14 @@ class Driver:
         self._store = JobStore(settings.database, wait_s=settings.database_wait_s)
         self._cluster = cluster or SharedCluster(settings)
         folder = StateFolder(settings.state.resolve(), settings.reserve_bytes)
-        self._shop = DriverParts(settings=settings, folder=folder, store=self._store, cluster=self._cluster)
-        self._perform = perform(self._shop, self.name)
+        self._parts = DriverParts(settings=settings, folder=folder, store=self._store, cluster=self._cluster)
+        self._perform = perform(self._parts, self.name)
         self._held: dict[str, LeasedJob] = {}
         self._busy = 0
         self._lock = threading.Lock()
         self._stopping = threading.Event()
         self._at_once = threading.Event()
-        self._attempts = Attempts(self._shop, self._perform, name=self.name, ending=self._stopping)
+        self._attempts = Attempts(self._parts, self._perform, name=self.name, ending=self._stopping)
         self._disk_watch = DiskWatch(folder.disk, self._all_held)
         self._sender = Sender(self._store, folder, settings, name=self.name)
         self._ended = threading.Event()
@@ -117,11 +118,11 @@ class Driver:
         """
         LOG.info("the driver starts", extra=self._facts)
         slots = [
-            threading.Thread(target=self._slot, name=f"slot-{number}", daemon=True)
+            self._loop(f"slot-{number}", self._slot, "cannot claim a job")
             for number in range(self._settings.driver_jobs)
         ]
-        clock = threading.Thread(target=self._keep_time, name="clock", daemon=True)
-        janitor = threading.Thread(target=self._tidy, name="janitor", daemon=True)
+        clock = self._loop("clock", self._tick, "cannot read the schedules")
+        janitor = self._loop("janitor", self._tidy, "the state folder could not be tidied")
         if self._parent_pipe is not None:
             threading.Thread(target=self._watch_parent, name="parent", daemon=True).start()
         threading.Thread(target=self._watch_disk, name="disk", daemon=True).start()
@@ -150,7 +151,7 @@ class Driver:
     def _start(self, threads: list[threading.Thread]) -> None:
         """Wait for the database, let the slots claim, then start the workers."""
         try:
-            self._shop.folder.make()
+            self._parts.folder.make()
             self._perform.preload()
             if not self._until_done(self._store.migrate, "the database cannot be migrated"):
                 return
@@ -245,29 +246,18 @@ class Driver:
 
     # --- the slots
 
-    def _slot(self) -> None:
-        """Claim and work, one job after the other."""
-        pauses = Pauses(DATABASE)
-        while True:
+    def _slot(self) -> float:
+        """Claim and work once; seconds until the next time."""
+        with self._lock:
+            # under the lock: the end of the driver must see every claim
+            if self._stopping.is_set():
+                return 0.0
+            self._busy += 1
+        try:
+            return 0.0 if self._claim_and_work() else self._settings.poll_s
+        finally:
             with self._lock:
-                # under the lock: the end of the driver must see every claim
-                if self._stopping.is_set():
-                    return
-                self._busy += 1
-            try:
-                worked = self._claim_and_work()
-                pauses.begin_anew()
-                wait_s = 0.0 if worked else self._settings.poll_s
-            except StoreError as error:
-                wait_s = pauses.next_s()
-                LOG.warning("cannot claim a job, next try in %g s: %s", wait_s, error, extra=self._facts)
-            except Exception:  # noqa: BLE001 - a slot that ended would leave a driver that looks alive and claims nothing
-                wait_s = pauses.next_s()
-                LOG.exception("an unexpected fault, next try in %g s", wait_s, extra=self._facts)
-            finally:
-                with self._lock:
-                    self._busy -= 1
-            self._stopping.wait(wait_s)
+                self._busy -= 1
 
     def _claim_and_work(self) -> bool:
         """Work on one job; whether there was one.
@@ -280,7 +270,7 @@ class Driver:
         if any(held.overdue for held in self._all_held()):
             # this machine slept: our own leases are renewed first, or our own jobs would count as lost
             return False
-        if self._shop.folder.disk.is_short:
+        if self._parts.folder.disk.is_short:
             return False
         settings, claimed_s = self._settings, time.monotonic()
         job = self._store.claim(self.name, lease_s=settings.lease_s, max_attempts=settings.max_attempts)
@@ -312,24 +302,8 @@ class Driver:
 
     # --- the clock of the schedules
 
-    def _keep_time(self) -> None:
-        """Check regularly for schedules that are due. Every driver does so; one of them decides each slot."""
-        pauses = Pauses(DATABASE)
-        while not self._stopping.is_set():
-            try:
-                self._tick()
-                pauses.begin_anew()
-                wait_s = self._settings.poll_s
-            except StoreError as error:
-                wait_s = pauses.next_s()
-                LOG.warning("cannot read the schedules, next try in %g s: %s", wait_s, error, extra=self._facts)
-            except Exception:  # noqa: BLE001 - without this thread the driver would look alive
-                wait_s = pauses.next_s()
-                LOG.exception("an unexpected fault with the schedules, next try in %g s", wait_s, extra=self._facts)
-            self._stopping.wait(wait_s)
-
-    def _tick(self) -> None:
-        """Decide what is due and log it.
+    def _tick(self) -> float:
+        """Decide which schedules are due and log it. Every driver does so; one of them decides each slot.
 
         Raises
         ------
@@ -344,24 +318,29 @@ class Driver:
             line = "schedule %s, %d slots up to %s: %s: %s"
             facts = self._facts | {"schedule": run.schedule_id, "job": run.job_id}
             LOG.log(level, line, run.schedule_id, run.slots, run.slot, run.outcome, run.message, extra=facts)
+        return settings.poll_s
 
     # --- the janitor
 
-    def _tidy(self) -> None:
-        while True:
-            try:
-                # those of drivers that were killed
-                removed = remove_left_folders()
-                removed += tidy(self._store, self._shop.folder, self._settings)
-                while self._store.webhooks.forget(self._settings.webhook_log_days):
-                    continue
-            except (StoreError, OSError) as error:
-                LOG.warning("the state folder could not be tidied: %s", error, extra=self._facts)
-            else:
-                if removed:
-                    LOG.info("tidied away %d folders", len(removed), extra=self._facts)
-            if self._stopping.wait(TIDY_S):
-                return
+    def _tidy(self) -> float:
+        """Remove what is not needed any longer; seconds until the next time."""
+        try:
+            # those of drivers that were killed
+            removed = remove_left_folders()
+            removed += tidy(self._store, self._parts.folder, self._settings)
+        except (StoreError, OSError) as error:
+            LOG.warning("the state folder could not be tidied: %s", error, extra=self._facts)
+        else:
+            if removed:
+                LOG.info("tidied away %d folders", len(removed), extra=self._facts)
+        return TIDY_S
+
+    def _loop(self, name: str, action: Callable[[], float], complaint: str) -> threading.Thread:
+        """A thread that repeats an action until the driver ends; not started yet."""
+        stopping, given = self._stopping, {"complaint": complaint, "facts": self._facts}
+        return threading.Thread(
+            target=repeat, args=(action, stopping.wait, stopping.is_set), kwargs=given, name=name, daemon=True
+        )
 
     def _until_done(self, action: Callable[[], None], complaint: str) -> bool:
         """Repeat an action until the database answers; False if the driver must end."""

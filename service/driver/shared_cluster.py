@@ -11,12 +11,11 @@ from urllib.parse import urlsplit
 
 from pipeline.errors import ClusterError, RunCancelledError
 from pipeline.runtime.cluster.dask_executor import Cluster
-from pipeline.runtime.cluster.serial_executor import Executor
 from pipeline.runtime.engine import workers_that_fit
 from pipeline.runtime.monitoring.measurement import cores, memory_bytes
 from pipeline.runtime.monitoring.progress import Event
 from pipeline.runtime.plan import LARGEST_TASK_BYTES
-from service.driver.leased_job import LOG, Engine, LeasedJob
+from service.driver.leased_job import LOG, LeasedJob
 from service.settings import ServiceSettings
 
 _CONNECT_S = 2.0
@@ -47,16 +46,16 @@ class SharedCluster:
         Certificates cannot be used.
     """
 
-    def __init__(self, settings: ServiceSettings, make: Callable[[], Engine] | None = None) -> None:
+    def __init__(self, settings: ServiceSettings, make: Callable[[], Cluster] | None = None) -> None:
         resources = settings.resources
         self._scheduler = resources.scheduler
         workers = resources.workers or _as_many_as_fit()
         self._make = make or (lambda: Cluster(workers=workers, scheduler=self._scheduler, tls=resources.tls))
         self._lock = threading.Lock()
-        self._engine: Engine | None = None
+        self._engine: Cluster | None = None
         self._closed = False
 
-    def engine(self) -> Engine:
+    def engine(self) -> Cluster:
         """The workers; started if there are none.
 
         Raises
@@ -71,22 +70,7 @@ class SharedCluster:
                 self._engine = self._make().__enter__()
             return self._engine
 
-    def executor(self, held: LeasedJob) -> Executor:
-        """An executor for the run of a job, as soon as there are workers.
-
-        Raises
-        ------
-        ClusterError
-            They do not start, or the driver ends.
-        RunCancelledError
-            The job was cancelled while it waited for them.
-        """
-        self.wait_until_there(held)
-        held.engine = self.engine()
-        # jobs are interactive: they go before batch runs on the same scheduler
-        return held.engine.executor(held.job.priority)
-
-    def replace(self, broken: Engine) -> None:
+    def replace(self, broken: Cluster) -> None:
         """Stop workers that broke; the next run starts new ones. A scheduler elsewhere is left alone.
 
         If another job has already replaced them, the new workers are left alone, too.

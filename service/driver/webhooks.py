@@ -14,9 +14,8 @@ import time
 from collections.abc import Callable, Mapping
 
 from pipeline import __version__
-from pipeline.backoff import Pauses
 from pipeline.runtime.monitoring import tracing
-from service.driver.attempts import DATABASE
+from service.driver.loops import repeat
 from service.errors import NoSuchOutputError, StoreError, TargetRefusedError
 from service.files import StateFolder
 from service.outputs import read_catalogue
@@ -36,16 +35,12 @@ LEASE_S = SEND_S + 15.0
 PACE_S = 0.25
 """Seconds between two rounds that claim and settle. Many messages share a transaction. Most are sent by then, so no
 thread that sends holds it up; in between others, such as the requests of clients, find the database free."""
-REFILL_S = 0.5
-"""Seconds between two looks at endpoints whose events wait for room."""
-LATE_S = 5.0
-"""Seconds between two looks at endpoints that may have to be paused."""
+LOOK_S = 5.0
+"""Longest pause between two rounds."""
 FORGET_S = 15.0
 """Seconds between two rounds that remove what the log has too much."""
 _ROUNDS = 20
 """Most transactions of such a round."""
-_MAX_BODIES = 64
-"""Bodies that are held for other receivers of the same event."""
 
 Post = Callable[..., tuple[int, str | None]]
 """`service.webhook_targets.post`."""
@@ -76,17 +71,18 @@ class Sender:
         self._name = name
         self._policy = retry_policy(settings.webhook_hours, settings.webhook_pause_s)
         self._receivers = Receivers(settings.webhook_pause_s)
-        self._attempts = Attempts(folder, settings, send)
+        self._folder = folder
+        self._post = send
         self._crew: list[threading.Thread] = []
         self._parcels: queue.SimpleQueue[Parcel] = queue.SimpleQueue()
         self._ended: queue.SimpleQueue[tuple[Parcel, Result]] = queue.SimpleQueue()
         self._unwritten: list[tuple[Parcel, Result]] = []
-        self._refill_at_s = self._late_at_s = 0.0
+        self._began_s = 0.0
         self._stopping = threading.Event()
         self._look_again = threading.Event()
         self.threads = [
             threading.Thread(target=self._work, name="webhooks", daemon=True),
-            threading.Thread(target=self._forget, name="webhooks-log", daemon=True),
+            threading.Thread(target=self._keep_log, name="webhooks-log", daemon=True),
         ]
         """Not started yet."""
 
@@ -98,23 +94,21 @@ class Sender:
     # --- the thread that claims and settles
 
     def _work(self) -> None:
-        pauses = Pauses(DATABASE)
-        while not (self._stopping.is_set() and self._receivers.under_way == 0):
-            began_s = time.monotonic()
-            self._look_again.clear()
-            try:
-                self._settle()
-                wait_s = LATE_S if self._stopping.is_set() else self._send_what_is_due()
-            except StoreError as error:
-                wait_s = pauses.next_s()
-                LOG.warning("cannot look for webhooks, next try in %g s: %s", wait_s, error, extra=self._facts)
-            except Exception:
-                wait_s = pauses.next_s()
-                LOG.exception("an unexpected fault with webhooks, next try in %g s", wait_s, extra=self._facts)
-            else:
-                pauses.begin_anew()
-            self._look_again.wait(wait_s)
-            self._stopping.wait(max(0.0, began_s + PACE_S - time.monotonic()))
+        def is_over() -> bool:
+            return self._stopping.is_set() and self._receivers.under_way == 0
+
+        repeat(self._round, self._wait, is_over, complaint="cannot look for webhooks", facts=self._facts)
+
+    def _round(self) -> float:
+        """Settle what has ended and claim what is due; seconds until the next round."""
+        self._began_s = time.monotonic()
+        self._look_again.clear()
+        self._settle()
+        return LOOK_S if self._stopping.is_set() else self._send_what_is_due()
+
+    def _wait(self, seconds: float) -> None:
+        self._look_again.wait(seconds)
+        self._stopping.wait(max(0.0, self._began_s + PACE_S - time.monotonic()))
 
     def _settle(self) -> None:
         """Write how attempts ended, all that have ended by now.
@@ -165,8 +159,6 @@ class Sender:
             The database does not answer.
         """
         now_s = time.monotonic()
-        if now_s >= self._refill_at_s:
-            self._refill(now_s)
         found = self._store.webhooks.claim_some(
             self._name,
             lambda line: self._receivers.chosen(line, now_s),
@@ -179,25 +171,7 @@ class Sender:
         while len(self._crew) < self._receivers.under_way:
             self._crew.append(threading.Thread(target=self._send, name=f"webhooks-{len(self._crew)}", daemon=True))
             self._crew[-1].start()
-        return min(self._settings.poll_s, LATE_S)
-
-    def _refill(self, now_s: float) -> None:
-        """Put events in line for endpoints that have room again.
-
-        Raises
-        ------
-        StoreError
-            The database does not answer.
-        """
-        with_late = now_s >= self._late_at_s
-        if with_late:
-            self._late_at_s = now_s + LATE_S
-        most = self._settings.webhook_max_waiting
-        found = self._store.webhooks.refill(max_waiting=most, with_late=with_late)
-        for endpoint_id in found.paused:
-            words = "webhook %s is paused: it does not keep up, and more than %d messages wait; replay it when it does"
-            LOG.warning(words, endpoint_id, most, extra=self._facts)
-        self._refill_at_s = now_s + REFILL_S
+        return min(self._settings.poll_s, LOOK_S)
 
     def _report(self, parcel: Parcel, result: Result, state: DeliveryState | None) -> None:
         """Log how an attempt ended."""
@@ -229,7 +203,7 @@ class Sender:
         try:
             parent = of_job(parcel.job)
             with tracing.span("webhook", kind="client", parent=parent, delivery_id=delivery.delivery_id) as made:
-                result = self._attempts.attempt(parcel, began_s)
+                result = self._sent(parcel, began_s)
                 tracing.note(made, event=delivery.event.value, attempt=delivery.attempts)
                 tracing.note(made, http__response__status_code=result.status)
                 if not result.is_success:
@@ -241,50 +215,14 @@ class Sender:
             result = Result(duration_ms=_since_ms(began_s), error=error, is_own_fault=True)
         return result
 
-    # --- the log
-
-    def _forget(self) -> None:
-        """Keep the log within its limits, so that the database does not grow without bound."""
-        settings = self._settings
-        while not self._stopping.wait(FORGET_S):
-            try:
-                for _ in range(_ROUNDS):
-                    if not self._store.webhooks.forget(settings.webhook_log_days, most=settings.webhook_log_max):
-                        break
-                    self._stopping.wait(PACE_S)
-            except StoreError as error:
-                LOG.warning("old deliveries cannot be removed yet: %s", error, extra=self._facts)
-
-    @property
-    def _facts(self) -> Mapping[str, object]:
-        return {"driver": self._name}
-
-
-class Attempts:
-    """Makes the bodies of messages, signs and posts them.
-
-    Parameters
-    ----------
-    folder : StateFolder
-        The results of jobs.
-    settings : ServiceSettings
-        Hosts, the service's URL.
-    send : callable
-        Posts a message.
-    """
-
-    def __init__(self, folder: StateFolder, settings: ServiceSettings, send: Post) -> None:
-        self._folder = folder
-        self._settings = settings
-        self._send = send
-        self._bodies: dict[tuple[str, str], str] = {}
-
-    def attempt(self, parcel: Parcel, began_s: float) -> Result:
+    def _sent(self, parcel: Parcel, began_s: float) -> Result:
         """Send a delivery once."""
         delivery = parcel.delivery
         try:
             # an attempt sends the same bytes as the one before
-            body = self._body(parcel) if delivery.body is None else delivery.body
+            body = delivery.body
+            if body is None:
+                body = body_of(parcel, self._folder, self._settings)
         except NoSuchOutputError as error:
             return Result(duration_ms=_since_ms(began_s), error=str(error), is_final=True)
         raw = body.encode()
@@ -297,7 +235,7 @@ class Attempts:
         if here is not None:
             headers["traceparent"] = here.traceparent
         try:
-            status, retry_after = self._send(delivery.url, headers=headers, body=raw, settings=self._settings)
+            status, retry_after = self._post(delivery.url, headers=headers, body=raw, settings=self._settings)
         except TargetRefusedError as error:
             return Result(duration_ms=_since_ms(began_s), error=str(error), is_final=True, body=body)
         except SendError as error:
@@ -310,23 +248,25 @@ class Attempts:
             body=body,
         )
 
-    def _body(self, parcel: Parcel) -> str:
-        """The body of a message; hundreds of endpoints get the same one at once.
+    # --- the log
 
-        Raises
-        ------
-        NoSuchOutputError
-            The results of the job are gone.
-        """
-        if parcel.event_id is None or parcel.delivery.endpoint_id is None:
-            return body_of(parcel, self._folder, self._settings)
-        key = (parcel.event_id, parcel.base)
-        body = self._bodies.get(key)
-        if body is None:
-            if len(self._bodies) >= _MAX_BODIES:
-                self._bodies = {}
-            body = self._bodies[key] = body_of(parcel, self._folder, self._settings)
-        return body
+    def _keep_log(self) -> None:
+        stopping = self._stopping
+        words = "old deliveries cannot be removed yet"
+        repeat(self._forget, stopping.wait, stopping.is_set, complaint=words, facts=self._facts)
+
+    def _forget(self) -> float:
+        """Keep the log within its limits, so that the database does not grow without bound."""
+        settings = self._settings
+        for _ in range(_ROUNDS):
+            if not self._store.webhooks.forget(settings.webhook_log_days, most=settings.webhook_log_max):
+                break
+            self._stopping.wait(PACE_S)
+        return FORGET_S
+
+    @property
+    def _facts(self) -> Mapping[str, object]:
+        return {"driver": self._name}
 
 
 def body_of(parcel: Parcel, folder: StateFolder, settings: ServiceSettings) -> str:

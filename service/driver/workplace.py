@@ -11,13 +11,17 @@ import json
 import os
 import re
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from service.files import StateFolder
 from service.jobs import Job
 
 HOLDER = "holder.json"
 """Name of the file that says which attempt works in a folder, or handed it back; only in folders that were."""
+END = "end.json"
+"""Name of the file with the end of an attempt that no database would take; the next driver writes it."""
 INPUTS = "inputs"
 """The files that the attempt fetched."""
 _ATTEMPT = re.compile(r"attempt-([0-9]+)")
@@ -112,6 +116,40 @@ def is_needed(place: Path, attempt: int, *, waits: bool) -> bool:
     return is_handed_back or (not waits and holder == attempt) or holder > attempt
 
 
+def leave_end(folder: StateFolder, job: Job, message: str, summary: dict[str, Any]) -> None:
+    """Write the end of an attempt that succeeded.
+
+    Raises
+    ------
+    OSError
+        The disk is full, or the folder is gone.
+    """
+    _write(folder.attempt(job.job_id, job.attempt) / END, {"message": message, "summary": summary})
+
+
+def has_end(attempt: Path) -> bool:
+    """Whether an attempt's folder has such a file."""
+    return (attempt / END).is_file()
+
+
+def take_over_end(folder: StateFolder, job: Job) -> tuple[str, dict[str, Any]] | None:
+    """The end of an earlier attempt, whose results become those of this one; None if there is none.
+
+    Raises
+    ------
+    OSError
+        The folder cannot be renamed.
+    """
+    for number in range(job.attempt - 1, 0, -1):
+        earlier = folder.attempt(job.job_id, number)
+        if has_end(earlier):
+            end = json.loads((earlier / END).read_text())
+            earlier.rename(folder.attempt(job.job_id, job.attempt))
+            (folder.attempt(job.job_id, job.attempt) / END).unlink()
+            return str(end["message"]), dict(end["summary"])
+    return None
+
+
 def _holder(place: Path) -> tuple[int, bool]:
     """The last attempt that worked in a folder, and whether it was handed back."""
     try:
@@ -123,9 +161,14 @@ def _holder(place: Path) -> tuple[int, bool]:
 
 
 def _write_holder(place: Path, attempt: int, *, handed_back: bool) -> None:
-    new = place / f".{HOLDER}"
+    _write(place / HOLDER, {"attempt": attempt, "handed_back": handed_back})
+
+
+def _write(path: Path, content: Mapping[str, Any]) -> None:
+    """Write a file whole, so that it survives a loss of power."""
+    new = path.with_name(f".{path.name}")
     with new.open("w") as stream:
-        json.dump({"attempt": attempt, "handed_back": handed_back}, stream)
+        json.dump(content, stream)
         stream.flush()
         os.fsync(stream.fileno())
-    new.rename(place / HOLDER)
+    new.rename(path)

@@ -1,6 +1,6 @@
-"""The tables of runs as collections of OGC API - Features: finished jobs, and runs that the operator publishes.
+"""The rows of runs, as pages of features: of finished jobs, of jobs that run, and of runs that the operator publishes.
 
-Features are read from the run's Parquet files, a row group at a time, so memory does not grow with the run. An index
-beside the state (`row_index`) says how many rows each row group has, where they lie, and which tile has which id. The
-modules that read import Arrow; routes import them when they are needed.
+Each run has one index (`index`, `writing`), a SQLite file with the rows of its tables. All that is asked for becomes a
+condition on these rows (`pages`, `cql2`): a job's buildings, and collections of OGC API - Features. Modules that write,
+or that transform coordinates, load Arrow and PROJ; routes import them when they are needed.
 """

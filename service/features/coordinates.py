@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import json
 import math
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -15,8 +16,8 @@ import pyproj
 import shapely
 
 from pipeline.io.crs import to_degrees
-from service.errors import NoSuchCollectionError, RequestError
-from service.features.row_index import Box
+from service.errors import RequestError
+from service.features.index import Box
 
 CRS84 = "http://www.opengis.net/def/crs/OGC/1.3/CRS84"
 """Longitude and latitude in WGS 84: the default."""
@@ -25,6 +26,7 @@ _ALWAYS = {CRS84: "OGC:CRS84", f"{_EPSG}4326": "EPSG:4326", f"{_EPSG}3857": "EPS
 _DECIMALS_DEG, _DECIMALS = 9, 3
 _EDGE_POINTS = 21
 """Points on each edge of a window whose image in another CRS is enclosed."""
+
 
 Geometries = npt.NDArray[np.object_]
 
@@ -51,51 +53,51 @@ class NamedCrs:
         return _DECIMALS_DEG if self.crs.is_geographic else _DECIMALS
 
 
-def _without_place(run: str, crs: str) -> NoSuchCollectionError:
-    return NoSuchCollectionError(
-        f"the coordinate reference system of run {run} is {crs}, so its features have no place on the globe "
-        "and cannot be a collection: model it again with --crs"
-    )
-
-
-class CollectionCrs:
+class RunCrs:
     """The CRS of a run and those into which its features are transformed.
 
-    Third coordinates become metres; in the run's own CRS, which is named without its vertical part, they are in its
-    horizontal unit.
+    A compound CRS is reduced to its horizontal part. Third coordinates become metres; in the run's own CRS they are in
+    its horizontal unit.
 
     Parameters
     ----------
     crs : mapping, optional
-        The `crs` entry of a run.json.
-    run : str
-        Name of the run, for the message.
-
-    Raises
-    ------
-    NoSuchCollectionError
-        The CRS is unknown or local: such features have no place on the globe.
+        The `crs` entry of a run.json; None or without `wkt` if it is unknown.
     """
 
-    def __init__(self, crs: Mapping[str, Any] | None, run: str) -> None:
-        if crs is None or crs.get("wkt") is None:
-            raise _without_place(run, "unknown")
-        whole = pyproj.CRS.from_wkt(crs["wkt"])
-        self.horizontal_unit_m = float(crs.get("horizontal_unit_m") or 1.0)
+    def __init__(self, crs: Mapping[str, Any] | None) -> None:
+        facts = crs or {}
+        self.vertical_unit_m: float | None = facts.get("vertical_unit_m")
+        """Metres per unit of elevations that are properties; None if unknown."""
+        self.horizontal_unit_m = float(facts.get("horizontal_unit_m") or 1.0)
         """Metres per unit of coordinates that are properties."""
-        self.vertical_unit_m = float(crs.get("vertical_unit_m") or 1.0)
-        """Metres per unit of elevations that are properties."""
-        self._own = (whole.sub_crs_list[0] if whole.is_compound else whole).to_2d()
-        if to_degrees(self._own) is None:
-            raise _without_place(run, f"local ({whole.name})")
-        self._wkt = self._own.to_wkt()
-        code = self._own.to_epsg()
-        self.storage_uri = None if code is None else f"{_EPSG}{code}"
-        """URI of the horizontal part of the run's CRS; None without an EPSG code."""
-        known = dict(_ALWAYS)
-        if self.storage_uri is not None:
-            known.setdefault(self.storage_uri, f"EPSG:{code}")
-        self._known = known
+        self.whole = None if facts.get("wkt") is None else pyproj.CRS.from_wkt(facts["wkt"])
+        """The CRS with its vertical part; None if it is unknown."""
+        self.name = None if self.whole is None else self.whole.name
+        """Its name."""
+        self.storage_uri: str | None = None
+        """URI of its horizontal part; None without an EPSG code."""
+        self.to_degrees: pyproj.Transformer | None = None
+        """The transformation to longitude and latitude; None without one, as of a local CRS."""
+        self._known = dict(_ALWAYS)
+        if self.whole is not None:
+            own = (self.whole.sub_crs_list[0] if self.whole.is_compound else self.whole).to_2d()
+            self.to_degrees = to_degrees(own)
+            self._wkt = own.to_wkt()
+            code = own.to_epsg()
+            if code is not None:
+                self.storage_uri = f"{_EPSG}{code}"
+                self._known.setdefault(self.storage_uri, f"EPSG:{code}")
+
+    @classmethod
+    def of_run(cls, crs: Mapping[str, Any] | None) -> RunCrs:
+        """The CRS of an entry of a run.json; the same object for the same entry."""
+        return _of_run(json.dumps(crs, sort_keys=True))
+
+    @property
+    def is_known(self) -> bool:
+        """Whether its features have a place on the globe."""
+        return self.to_degrees is not None
 
     @property
     def uris(self) -> list[str]:
@@ -150,7 +152,7 @@ class CollectionCrs:
     def _with_heights(self, geometries: Geometries, target: NamedCrs) -> Geometries:
         """Geometries with the third coordinate in the unit that the target has."""
         unit_m = self.horizontal_unit_m if target.uri == self.storage_uri else 1.0
-        factor = self.vertical_unit_m / unit_m
+        factor = (self.vertical_unit_m or 1.0) / unit_m
         if math.isclose(factor, 1.0, rel_tol=1e-9) or not shapely.has_z(geometries).any():
             return geometries
         return np.asarray(_transformed(geometries, lambda xyz: xyz * [1.0, 1.0, factor]), dtype=object)
@@ -186,6 +188,11 @@ def _swapped(xyz: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
 
 
 @functools.lru_cache(maxsize=64)
+def _of_run(text: str) -> RunCrs:
+    return RunCrs(json.loads(text))
+
+
+@functools.lru_cache(maxsize=64)
 def _crs(name: str) -> pyproj.CRS:
     return pyproj.CRS.from_user_input(name)
 
@@ -200,39 +207,3 @@ def _own_transformer(source: str, target: str, thread: int) -> pyproj.Transforme
 def in_easting_order(geometry: shapely.Geometry, crs: NamedCrs) -> shapely.Geometry:
     """A client's geometry with its easting first."""
     return shapely.transform(geometry, _swapped) if crs.is_northing_first else geometry
-
-
-def parsed_window(text: str, crs: NamedCrs) -> Sequence[Box]:
-    """The boxes of a query parameter bbox, easting first: two where a window in degrees crosses the 180th meridian.
-
-    Raises
-    ------
-    RequestError
-        It is not a window.
-
-    Examples
-    --------
-    >>> parsed_window("170,-10,-170,10", NamedCrs(uri=CRS84, crs=pyproj.CRS("OGC:CRS84")))
-    [(170.0, -10.0, 180.0, 10.0), (-180.0, -10.0, -170.0, 10.0)]
-    """
-    try:
-        # Python also reads 1_000
-        values = [float(part) for part in text.replace("_", "?").split(",", 6)]
-    except ValueError:
-        values = []
-    if len(values) == 6 and np.isfinite(values).all():
-        raise RequestError([f"query bbox is {text[:80]!r}: {crs.uri} has no vertical axis, give four numbers"])
-    if len(values) != 4 or not np.isfinite(values).all():
-        raise RequestError([f"query bbox is {text[:80]!r}: give four numbers, such as 4.35,52.00,4.37,52.01"])
-    if crs.is_northing_first:
-        values = [values[1], values[0], values[3], values[2]]
-    west, south, east, north = values
-    if crs.crs.is_geographic and (max(abs(west), abs(east)) > 180.0 or max(abs(south), abs(north)) > 90.0):
-        raise RequestError([f"query bbox is {text[:80]!r}: longitudes reach from -180 to 180, latitudes to 90"])
-    if south > north:
-        raise RequestError([f"query bbox is {text[:80]!r}: its south {south:g} lies north of its north {north:g}"])
-    if west <= east:
-        return [(west, south, east, north)]
-    if not crs.crs.is_geographic:
-        raise RequestError([f"query bbox is {text[:80]!r}: its west {west:g} lies east of its east {east:g}"])
-    return [(west, south, 180.0, north), (-180.0, south, east, north)]

@@ -1,7 +1,8 @@
-"""Filters in CQL2 (OGC 21-065): from the tree of a filter to a mask over rows.
+"""Filters in CQL2 (OGC 21-065): from the tree of a filter to a condition in SQL.
 
-The library `cql2` parses the text. A tree is checked against the columns of a table before anything is read, and
-evaluated with three values: a comparison with null is neither true nor false, and selects nothing.
+The library `cql2` parses the text. The SQL that it writes is PostgreSQL's: SQLite knows neither `SOME(ARRAY[..])` nor
+`E'..'` nor its times and spatial functions, and a comparison of a number with a text would pass. So a tree is checked
+against the columns of a table here, and becomes SQL with placeholders for all values.
 """
 
 from __future__ import annotations
@@ -10,19 +11,18 @@ import dataclasses
 import datetime as dt
 import json
 import math
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import cql2
 import numpy as np
-import pyarrow as pa
-import pyarrow.compute as pc
 import shapely
 
 from service.errors import RequestError
-from service.features.coordinates import Geometries, NamedCrs, in_easting_order
-from service.features.row_index import Box
-from service.features.tables import GEOMETRY
+from service.features.coordinates import NamedCrs, in_easting_order
+from service.features.index import Box, stamp
+from service.features.pages import GEOMETRY, Condition, ShapeTest
 
 MAX_LENGTH = 4000
 """Longest filter, in characters."""
@@ -31,14 +31,7 @@ MAX_DEPTH = 7
 MAX_NODES = 500
 """Largest number of operations in a filter."""
 
-_COMPARISONS = {
-    "=": pc.equal,
-    "<>": pc.not_equal,
-    "<": pc.less,
-    "<=": pc.less_equal,
-    ">": pc.greater,
-    ">=": pc.greater_equal,
-}
+_COMPARISONS = frozenset({"=", "<>", "<", "<=", ">", ">="})
 _SPATIAL = {
     "s_intersects": shapely.intersects,
     "s_disjoint": shapely.disjoint,
@@ -49,36 +42,14 @@ _SPATIAL = {
     "s_crosses": shapely.crosses,
     "s_equals": shapely.equals,
 }
+_GEOMETRY = {"property": GEOMETRY}
 _MIRRORED = {"s_within": "s_contains", "s_contains": "s_within"}
-_TYPES = {"text": pa.string(), "number": pa.float64(), "boolean": pa.bool_(), "time": pa.timestamp("us", tz="UTC")}
-
-
-@dataclasses.dataclass(frozen=True)
-class Rows:
-    """Rows that a filter looks at."""
-
-    columns: Mapping[str, pa.Array]
-    """The columns that it names."""
-    geometries: Geometries | None
-    """Their geometries in the CRS of the filter; None if it does not need them."""
-    n: int
-    """Number of rows."""
-
-
-Mask = Callable[[Rows], pa.Array]
-"""Gets rows; one value per row: true, false or null."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Filter:
+class Filter(Condition):
     """A filter that fits a table."""
 
-    mask: Mask
-    """Evaluates it."""
-    columns: frozenset[str]
-    """The properties that it names."""
-    is_spatial: bool
-    """Whether it needs geometries."""
     window: Box | None
     """Only rows with a geometry here can be selected, in its CRS, easting first; None for no such bound."""
 
@@ -173,7 +144,7 @@ _LITERALS: Mapping[str, tuple[Callable[[str], Any], str]] = {
 }
 
 
-def compiled(tree: Any, queryables: Mapping[str, str], crs: NamedCrs) -> Filter:
+def compiled(tree: Any, queryables: Mapping[str, str], crs: NamedCrs, shapes: list[ShapeTest]) -> Filter:
     """A filter for a table.
 
     Parameters
@@ -184,20 +155,17 @@ def compiled(tree: Any, queryables: Mapping[str, str], crs: NamedCrs) -> Filter:
         Kinds of the properties by their names.
     crs : NamedCrs
         The CRS of coordinates in the filter.
+    shapes : list of ShapeTest
+        Gets the tests of geometries, which the condition names by their numbers.
 
     Raises
     ------
     RequestError
         It names something unknown, or compares what cannot be compared.
     """
-    compiler = _Compiler(queryables, crs)
-    mask = compiler.condition(tree)
-    return Filter(
-        mask=mask,
-        columns=frozenset(compiler.columns),
-        is_spatial=compiler.is_spatial,
-        window=compiler.window(tree),
-    )
+    compiler = _Compiler(queryables, crs, shapes)
+    sql = compiler.condition(tree)
+    return Filter(sql=sql, values=tuple(compiler.values), window=compiler.window(tree))
 
 
 def _fault(problem: str) -> RequestError:
@@ -209,89 +177,58 @@ def _shown(node: Any) -> str:
 
 
 class _Compiler:
-    """Turns a tree into a mask, and notes what it needs."""
+    """Turns a tree into SQL, with its values in the order of their places."""
 
-    def __init__(self, queryables: Mapping[str, str], crs: NamedCrs) -> None:
+    def __init__(self, queryables: Mapping[str, str], crs: NamedCrs, shapes: list[ShapeTest]) -> None:
         self._queryables = queryables
         self._crs = crs
+        self._shapes = shapes
         self._nodes = 0
-        self.columns: set[str] = set()
-        self.is_spatial = False
+        self.values: list[Any] = []
 
-    def condition(self, node: Any, depth: int = 0) -> Mask:
+    def condition(self, node: Any, depth: int = 0) -> str:
         """An expression that is true, false or null for each row."""
         self._nodes += 1
         if self._nodes > MAX_NODES or depth > MAX_NODES // 5:
             raise _fault(f"it has more than {MAX_NODES} operations, or too many within one another")
-        if isinstance(node, bool):
-            return lambda rows: pa.repeat(pa.scalar(node), rows.n)
-        if isinstance(node, Mapping) and "property" in node:
+        if isinstance(node, bool) or (isinstance(node, Mapping) and "property" in node):
             kind, value = self._operand(node)
             if kind != "boolean":
                 raise _fault(f"{_shown(node)} is a {kind}, not a condition: compare it")
             return value
-        operation, args = self._operation(node)
-        if operation in {"and", "or"} and len(args) >= 2:
-            parts = [self.condition(arg, depth + 1) for arg in args]
-            join = pc.and_kleene if operation == "and" else pc.or_kleene
-
-            def joined(rows: Rows) -> pa.Array:
-                found = parts[0](rows)
-                for part in parts[1:]:
-                    found = join(found, part(rows))
-                return found
-
-            return joined
-        if operation == "not" and len(args) == 1:
-            inner = self.condition(args[0], depth + 1)
-            return lambda rows: pc.invert(inner(rows))
-        return self._test(operation, args)
-
-    def _operation(self, node: Any) -> tuple[str, list[Any]]:
         if not (isinstance(node, Mapping) and isinstance(node.get("op"), str) and isinstance(node.get("args"), list)):
             raise _fault(f"{_shown(node)} is not a condition: use a comparison such as status = 'ok'")
-        return node["op"].lower() if node["op"] != "isNull" else "isNull", node["args"]
+        operation, args = node["op"].lower(), node["args"]
+        if operation in {"and", "or"} and len(args) >= 2:
+            return f"({f' {operation} '.join(self.condition(arg, depth + 1) for arg in args)})"
+        if operation == "not" and len(args) == 1:
+            return f"(not {self.condition(args[0], depth + 1)})"
+        return f"({self._test(operation, args)})"
 
-    def _test(self, operation: str, args: Sequence[Any]) -> Mask:
+    def _test(self, operation: str, args: Sequence[Any]) -> str:
         """A condition without conditions in it."""
         if operation in _COMPARISONS and len(args) == 2:
-            compare = _COMPARISONS[operation]
             left, right = self._alike(args)
-            return lambda rows: compare(left(rows), right(rows))
+            return f"{left} {operation} {right}"
         if operation == "between" and len(args) == 3:
             value, low, high = self._alike(args)
-            return lambda rows: pc.and_kleene(
-                pc.greater_equal(value(rows), low(rows)), pc.less_equal(value(rows), high(rows))
-            )
+            return f"{value} between {low} and {high}"
         if operation == "in" and len(args) == 2 and isinstance(args[1], list) and args[1]:
             value, *listed = self._alike([args[0], *args[1]])
-
-            def among(rows: Rows) -> pa.Array:
-                one = value(rows)
-                found = pc.equal(one, listed[0](rows))
-                for other in listed[1:]:
-                    found = pc.or_kleene(found, pc.equal(one, other(rows)))
-                return found
-
-            return among
+            return f"{value} in ({', '.join(listed)})"
         if operation == "like" and len(args) == 2 and isinstance(args[1], str):
             kind, value = self._operand(args[0])
             if kind != "text":
                 raise _fault(f"{_shown(args[0])} is a {kind}: LIKE compares texts")
-            pattern = args[1]
-            return lambda rows: pc.match_like(value(rows), pattern)
-        if operation == "isNull" and len(args) == 1:
-            if args[0] == {"property": GEOMETRY}:
-                self.is_spatial = True
-                return lambda rows: pa.array(shapely.is_missing(_geometries(rows)))
-            _, value = self._operand(args[0])
-            return lambda rows: pc.is_null(value(rows))
+            return f"{value} like {self._literal(args[1])[1]} escape '\\'"
+        if operation == "isnull" and len(args) == 1:
+            return f"{GEOMETRY if args[0] == _GEOMETRY else self._operand(args[0])[1]} is null"
         if operation in _SPATIAL and len(args) == 2:
             return self._spatial(operation, args)
-        known = ", ".join(["and", "or", "not", *_COMPARISONS, "between", "in", "like", "isNull", *_SPATIAL])
+        known = ", ".join(["and", "or", "not", *sorted(_COMPARISONS), "between", "in", "like", "isNull", *_SPATIAL])
         raise _fault(f"{operation[:40]!r} with {len(args)} arguments is not supported: use {known}")
 
-    def _alike(self, args: Sequence[Any]) -> list[Mask]:
+    def _alike(self, args: Sequence[Any]) -> list[str]:
         """Operands that can be compared."""
         operands = [self._operand(arg) for arg in args]
         kinds = {kind for kind, _ in operands}
@@ -300,54 +237,51 @@ class _Compiler:
             raise _fault(f"{shown[:300]} cannot be compared: give values of one kind")
         return [value for _, value in operands]
 
-    def _operand(self, node: Any) -> tuple[str, Mask]:
-        """Kind and values of a property or a literal."""
+    def _operand(self, node: Any) -> tuple[str, str]:
+        """Kind and SQL of a property or a literal."""
         if isinstance(node, Mapping) and isinstance(node.get("property"), str):
             name = node["property"]
             if name not in self._queryables:
                 known = ", ".join([*self._queryables, GEOMETRY])
                 raise _fault(f"{name[:80]!r} is not a property that can be used here: use one of {known}")
-            self.columns.add(name)
-            kind = self._queryables[name]
-            return kind, lambda rows: pc.cast(rows.columns[name], _TYPES[kind])
-        kind, value = self._literal(node)
-        constant = pa.scalar(value, _TYPES[kind])
-        return kind, lambda rows: pa.repeat(constant, rows.n)
+            return self._queryables[name], f'"{name}"'
+        return self._literal(node)
+
+    def _literal(self, node: Any) -> tuple[str, str]:
+        kind, value = self._value(node)
+        self.values.append(value)
+        return kind, "?"
 
     @staticmethod
-    def _literal(node: Any) -> tuple[str, Any]:
+    def _value(node: Any) -> tuple[str, Any]:
+        """Kind and value of a literal."""
         if isinstance(node, bool):
             return "boolean", node
-        if isinstance(node, int | float) and math.isfinite(node):
+        if isinstance(node, int | float) and abs(node) <= sys.float_info.max:
             return "number", float(node)
-        if isinstance(node, str):
+        if isinstance(node, str) and node.encode(errors="ignore").decode() == node:  # no half of a pair
             return "text", node
         if isinstance(node, Mapping) and len(node) == 1:
             ((word, text),) = node.items()
             if word in {"timestamp", "date"} and isinstance(text, str):
                 try:
                     return "time", _time(text)
-                except ValueError:
+                except (ValueError, OverflowError):
                     raise _fault(f"{text[:80]!r} is not a time: use one such as 2024-03-01T09:30:00Z") from None
         raise _fault(f"{_shown(node)} is not supported here: use a property, a text, a number, true, false or a time")
 
-    def _spatial(self, operation: str, args: Sequence[Any]) -> Mask:
-        if args[0] != {"property": GEOMETRY}:
+    def _spatial(self, operation: str, args: Sequence[Any]) -> str:
+        if args[0] != _GEOMETRY:
             args, operation = [args[1], args[0]], _MIRRORED.get(operation, operation)
-        if args[0] != {"property": GEOMETRY}:
+        if args[0] != _GEOMETRY:
             raise _fault(
                 f"{operation} compares the property {GEOMETRY} with a geometry, and {_shown(args[0])} is not it"
             )
         geometry = self._geometry(args[1])
         shapely.prepare(geometry)
-        self.is_spatial = True
         test = _SPATIAL[operation]
-
-        def related(rows: Rows) -> pa.Array:
-            found = _geometries(rows)
-            return pa.array(test(found, geometry), mask=shapely.is_missing(found))
-
-        return related
+        self._shapes.append(ShapeTest(crs=self._crs, test=lambda shapes: test(shapes, geometry)))
+        return f"shape({len(self._shapes) - 1}, position)"
 
     def _geometry(self, node: Any) -> shapely.Geometry:
         """A geometry of the filter, easting first."""
@@ -371,17 +305,12 @@ class _Compiler:
             found = [box for box in map(self.window, node["args"]) if box is not None]
             return found[0] if found else None
         if node.get("op") in _SPATIAL and node["op"] != "s_disjoint":
-            literal = next(arg for arg in node["args"] if arg != {"property": GEOMETRY})
+            literal = next(arg for arg in node["args"] if arg != _GEOMETRY)
             west, south, east, north = shapely.bounds(self._geometry(literal))
             return float(west), float(south), float(east), float(north)
         return None
 
 
-def _geometries(rows: Rows) -> Geometries:
-    assert rows.geometries is not None
-    return rows.geometries
-
-
-def _time(text: str) -> dt.datetime:
+def _time(text: str) -> str:
     at = dt.datetime.fromisoformat(text)
-    return at if at.tzinfo is not None else at.replace(tzinfo=dt.UTC)
+    return stamp(at if at.tzinfo is not None else at.replace(tzinfo=dt.UTC))

@@ -1,315 +1,266 @@
-"""Pages of features: which rows a request selects, read a row group at a time, and their GeoJSON."""
+"""Pages of features: which rows of an index a request selects, and their GeoJSON.
+
+A selection is SQL. Geometries are tested beside it, for many rows at a time: `shape(k, position)` in a condition is the
+answer of test k for a row.
+"""
 
 from __future__ import annotations
 
-import collections
-import contextlib
 import dataclasses
 import datetime as dt
+import functools
 import json
-import threading
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+import sqlite3
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
-import pyarrow as pa
-import pyarrow.compute as pc
-import pyarrow.parquet as pq
 import shapely
 
-from service.errors import NoSuchFeatureError
-from service.features.coordinates import NamedCrs
-from service.features.cql2 import Filter, Rows
-from service.features.row_index import Box, Part
-from service.features.tables import GEOMETRY, TILE, Layer, OpenRun, unreadable
+from service.features.index import TIMES, Box, Part, RowIndex, parts, stamp
 
-MAX_READ = 1000
-"""Row groups of which rows are looked at for one page. Then a page that has a feature is short, and its link goes on;
-one without goes on itself, since clients take an empty page for the last."""
-MAX_COUNTED = 250
-"""Most row groups of which rows are looked at to count all matches; beyond, the answer has no number."""
+if TYPE_CHECKING:
+    from service.features.coordinates import Geometries, NamedCrs, RunCrs
+
+GEOMETRY = "geometry"
+"""The property that is a geometry."""
+MAX_READ = 1_000_000
+"""Rows that are looked at for one page. Then a page that has a feature is short, and its link goes on; one without goes
+on itself, since clients take an empty page for the last."""
+MAX_COUNTED = 250_000
+"""Most rows that are looked at to count all matches; beyond, the answer has no number."""
 _KEPT_COUNTS = 4096
+_AT_ONCE = 500
+"""Features whose texts are made at once."""
 
 Interval = tuple[dt.datetime | None, dt.datetime | None]
-_TIMES = ("acquired_from", "acquired_to")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class FeatureQuery:
-    """The query for a page."""
+class Condition:
+    """A condition on rows."""
+
+    sql: str
+    """As SQL, in parentheses."""
+    values: tuple[Any, ...] = ()
+    """The values of its placeholders."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ShapeTest:
+    """A test of geometries."""
 
     crs: NamedCrs
-    """CRS of the answer."""
-    boxes: Sequence[Box] | None = None
-    """Rows whose geometry meets one of these, or that have none; easting first."""
-    boxes_crs: NamedCrs
-    """Their CRS."""
-    interval: Interval | None = None
-    """Rows acquired in this time, or at an unknown one."""
-    filters: Sequence[Filter] = ()
-    """Rows that all of these select."""
-    filter_crs: NamedCrs
-    """CRS of the coordinates in them."""
-    key: str = ""
-    """The same for queries that select the same rows."""
-    limit: int = 100
-    """Maximum number of features."""
-    start: int = 0
-    """Position in the collection of the first row that is looked at."""
+    """The CRS of the geometries, easting first."""
+    test: Callable[[Geometries], Any]
+    """One answer per geometry; that of a missing one is not looked at."""
+
+
+def among(column: str, words: Sequence[str]) -> Condition:
+    """Rows with one of some words."""
+    return Condition(sql=f"({column} IN ({', '.join('?' * len(words))}))", values=tuple(words))
+
+
+def acquired_in(interval: Interval) -> Condition:
+    """Rows whose acquisition meets an interval, or is unknown."""
+    named = [(name, sign, at) for name, sign, at in zip(TIMES, ("<=", ">="), interval[::-1], strict=True) if at]
+    text = " AND ".join(f"({name} IS NULL OR {name} {sign} ?)" for name, sign, _ in named)
+    return Condition(sql=f"({text or 'TRUE'})", values=tuple(stamp(at) for *_, at in named))
+
+
+def bounded_by(boxes: Sequence[Box], *, native: bool) -> Condition:
+    """Buildings whose footprint's bounds meet one of some boxes, border included; those without footprint never do."""
+    names = ("x_min", "x_max", "y_min", "y_max") if native else ("west", "east", "south", "north")
+    text = " AND ".join(f"{name} {sign} ?" for name, sign in zip(names, ("<=", ">=") * 2, strict=True))
+    corners = tuple(value for west, south, east, north in boxes for value in (east, west, north, south))
+    return Condition(sql=f"({' OR '.join([text] * len(boxes))})", values=corners)
+
+
+# --- which rows ------------------------------------------------------------------------------------------------------
+
+
+def sorted_page(
+    index: RowIndex, conditions: Sequence[Condition], *, by: str, limit: int, offset: int
+) -> tuple[int, list[int]]:
+    """The number of buildings that meet all conditions, and positions of those of a page, in the order of a column."""
+    where, values = _joined(conditions)
+    with index.opened() as connection:
+        (matched,) = connection.execute(f"SELECT count(*) FROM buildings WHERE {where}", values).fetchone()  # noqa: S608 - our own words
+        page = f"SELECT position FROM buildings WHERE {where} ORDER BY {by} LIMIT ? OFFSET ?"  # noqa: S608
+        return matched, [position for (position,) in connection.execute(page, (*values, limit, offset))]
+
+
+def _joined(conditions: Sequence[Condition]) -> tuple[str, list[Any]]:
+    return (
+        " AND ".join(["TRUE", *(one.sql for one in conditions)]),
+        [value for one in conditions for value in one.values],
+    )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class FeaturePage:
-    """One page."""
+class Search:
+    """A search for rows of a table in their order; equal for searches that select the same rows."""
 
-    features: Sequence[bytes]
-    """GeoJSON texts, in the order of the collection."""
-    matched: int | None
-    """Features on all pages; None if counting them would take too long."""
-    following: int | None
-    """`start` of the next page; None if there is none."""
+    version: str
+    """State of the run."""
+    table: str
+    """Name of the table."""
+    key: str
+    """The same for requests that select the same rows."""
+    index: RowIndex = dataclasses.field(compare=False)
+    """Its rows."""
+    crs: RunCrs = dataclasses.field(compare=False)
+    """The CRS of the run."""
+    conditions: Sequence[Condition] = dataclasses.field(default=(), compare=False)
+    """All that rows must meet, beside the boxes."""
+    shapes: Sequence[ShapeTest] = dataclasses.field(default=(), compare=False)
+    """The tests that the conditions name."""
+    boxes: Sequence[Box] | None = dataclasses.field(default=None, compare=False)
+    """Rows whose geometry meets one of these, or that have none; easting first."""
+    boxes_crs: NamedCrs = dataclasses.field(compare=False)
+    """Their CRS."""
+    windows: Sequence[Box] | None = dataclasses.field(default=None, compare=False)
+    """Boxes of the run's CRS in which all wanted geometries lie, beside rows without; None for anywhere."""
 
+    def page(self, limit: int, start: int) -> tuple[list[int], int | None]:
+        """Positions of at most so many rows from `start` on, and the start of the next page; None if there is none."""
+        found: list[int] = []
+        looked_at = 0
+        with self.index.opened() as connection:
+            rows = _Rows(self, connection)
+            for part in rows.parts(start):
+                if found and looked_at >= MAX_READ:
+                    return found, part.first
+                looked_at += part.n
+                found += [position for position in rows.selected(part) if position >= start]
+                if len(found) > limit:
+                    return found[:limit], found[limit]
+        return found, None
 
-def feature_page(run: OpenRun, layer: Layer, query: FeatureQuery) -> FeaturePage:
-    """One page of features.
-
-    Raises
-    ------
-    NoSuchCollectionError
-        A file of the run cannot be read.
-    """
-    try:
-        return _Search(run, layer, query).page()
-    except (OSError, pa.ArrowException) as error:
-        raise unreadable(run.run, error) from error
-
-
-def single_feature(run: OpenRun, layer: Layer, feature_id: str, crs: NamedCrs) -> bytes:
-    """One feature as GeoJSON text.
-
-    Raises
-    ------
-    NoSuchFeatureError
-        There is none with this id.
-    NoSuchCollectionError
-        A file of the run cannot be read.
-    """
-    parts, wanted = _places(run, layer, feature_id)
-    try:
-        for part in parts:
-            with _reading(run, part) as reader:
-                found = reader.read([name for name, _ in wanted])
-                mask = np.ones(part.n, bool)
-                for name, value in wanted:
-                    mask &= np.asarray(pc.fill_null(pc.equal(found[name], value), fill_value=False))
-                if mask.any():
-                    return next(_features(run, layer, reader, np.flatnonzero(mask)[:1], crs))
-    except (OSError, pa.ArrowException) as error:
-        raise unreadable(run.run, error) from error
-    raise NoSuchFeatureError(f"{run.run.collection_id(layer.table)} holds no feature {feature_id[:80]!r}")
-
-
-def _places(run: OpenRun, layer: Layer, feature_id: str) -> tuple[list[Part], list[tuple[str, Any]]]:
-    """The row groups that can hold a feature, and the values of columns that it has."""
-    if layer.table == "rejected":
-        return run.index.parts_with("rejected", feature_id), [("object_id", feature_id)]
-    building_id, _, number = feature_id.partition(".") if layer.table == "planes" else (feature_id, "", "")
-    found = run.index.parts_with("buildings", building_id)
-    if layer.table == "buildings" or not found:
-        return found, [("building_id", building_id)]
-    # "07" and "7" would be two ids of one plane
-    if not (number.isascii() and number.isdigit() and str(int(number[:9])) == number):
-        return [], []
-    return run.index.parts_of_tile("planes", found[0].tile), [("building_id", building_id), ("plane_id", int(number))]
+    @functools.lru_cache(maxsize=_KEPT_COUNTS)  # noqa: B019 - the pages of one list share their number
+    def matched(self) -> int | None:
+        """The number of rows on all pages; None if counting would take too long."""
+        if not self.conditions and self.boxes is None:
+            return self.index.totals(self.table).n
+        with self.index.opened() as connection:
+            rows = _Rows(self, connection)
+            near = rows.parts()
+            looked_at = sum(part.n for part in near if self.conditions or not rows.is_inside(part))
+            return None if looked_at > MAX_COUNTED else sum(len(rows.selected(part)) for part in near)
 
 
-class _Reader:
-    """Columns of one row group."""
+class _Rows:
+    """The rows of a search, part by part."""
 
-    def __init__(self, file: pq.ParquetFile, part: Part) -> None:
-        self._file = file
-        self._part = part
-        self._names = set(file.schema_arrow.names)
+    def __init__(self, search: Search, connection: sqlite3.Connection) -> None:
+        self._search = search
+        self._connection = connection
+        connection.create_function("shape", 2, lambda k, position: self._answers[k][position - self._first])
+        boxes = search.boxes
+        self._union = None if boxes is None else shapely.union_all([shapely.box(*box) for box in boxes])
+        self._first = 0
+        self._answers: list[list[bool | None]] = []
 
-    def read(self, names: Sequence[str]) -> dict[str, pa.Array]:
-        """Columns by their names; `tile` is made, and one that an older run lacks is null."""
-        stored = [name for name in names if name in self._names]
-        table = self._file.read_row_group(self._part.row_group, columns=stored, use_threads=False)
-        found = {name: table.column(name).combine_chunks() for name in stored}
-        for name in names:
-            if name == TILE:
-                found[name] = pa.repeat(pa.scalar(self._part.tile), self._part.n)
-            elif name not in found:
-                found[name] = pa.nulls(self._part.n)
-        return found
+    def parts(self, start: int = 0) -> list[Part]:
+        """The parts that can hold what is looked for."""
+        return parts(self._connection, self._search.table, self._search.windows, start)
 
-    def geometries(self) -> npt.NDArray[np.object_]:
-        """The geometries of all rows, None where there is none."""
-        column = self.read([GEOMETRY])[GEOMETRY]
-        return _from_wkb(column)
-
-
-def _from_wkb(column: pa.Array) -> npt.NDArray[np.object_]:
-    return np.asarray(shapely.from_wkb(np.array([*column.to_pylist(), None], dtype=object)[:-1]), dtype=object)
-
-
-@contextlib.contextmanager
-def _reading(run: OpenRun, part: Part) -> Iterator[_Reader]:
-    """The row group, opened."""
-    with run.filesystem.open_input_file(part.path) as stream:
-        yield _Reader(pq.ParquetFile(stream), part)
-
-
-class _Counts:
-    """Numbers of matches of the latest queries: the pages of one list share theirs."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._found: collections.OrderedDict[tuple[str, str, str], int] = collections.OrderedDict()
-
-    def get(self, key: tuple[str, str, str]) -> int | None:
-        with self._lock:
-            return self._found.get(key)
-
-    def put(self, key: tuple[str, str, str], count: int) -> None:
-        with self._lock:
-            self._found[key] = count
-            if len(self._found) > _KEPT_COUNTS:
-                self._found.popitem(last=False)
-
-
-_counts = _Counts()
-
-
-class _Search:
-    """Looks for the rows of one page."""
-
-    def __init__(self, run: OpenRun, layer: Layer, query: FeatureQuery) -> None:
-        self._run = run
-        self._layer = layer
-        self._query = query
-        names = {name for one in query.filters for name in one.columns}
-        self._has_times = query.interval is not None and layer.has_times
-        self._columns = sorted(names | set(_TIMES)) if self._has_times else sorted(names)
-        self._selects = bool(query.filters) or self._has_times
-        self._union = None if query.boxes is None else shapely.union_all([shapely.box(*box) for box in query.boxes])
-        self._windows = self._searched()
-
-    def _searched(self) -> list[Box] | None:
-        """Windows of the run's CRS in which all wanted geometries lie, beside rows without; None for anywhere."""
-        query, crs = self._query, self._run.crs
-        if query.boxes is not None:
-            found = [crs.window(box, query.boxes_crs) for box in query.boxes]
-        else:
-            found = [crs.window(one.window, query.filter_crs) for one in query.filters if one.window is not None][:1]
-        return None if not found or None in found else [box for box in found if box is not None]
-
-    def page(self) -> FeaturePage:
-        """The page."""
-        query, layer = self._query, self._layer
-        key = (self._run.version, layer.table, query.key)
-        matched = _counts.get(key) if self._selects or self._union is not None else self._run.totals(layer.table).n
-        counting = matched is None and self._can_count()
-        # counting begins at the first row, a page at its own
-        parts = self._run.index.parts(layer.table, self._windows, 0 if counting else query.start)
-        features: list[bytes] = []
-        count, looked_at, following = 0, 0, None
-        for part in parts:
-            if not counting and following is not None:
-                break
-            if not counting and features and looked_at >= MAX_READ:
-                following = part.first
-                break
-            rows, was_read = self._rows(part)
-            looked_at += was_read
-            count += len(rows)
-            wanted = rows[rows + part.first >= query.start] if following is None else rows[:0]
-            room = query.limit - len(features)
-            if len(wanted) > room:
-                following = part.first + int(wanted[room])
-                wanted = wanted[:room]
-            if len(wanted):
-                with _reading(self._run, part) as reader:
-                    features += _features(self._run, layer, reader, wanted, query.crs)
-        if counting:
-            matched = count
-            _counts.put(key, count)
-        return FeaturePage(features=features, matched=matched, following=following)
-
-    def _can_count(self) -> bool:
-        """Whether few enough row groups must be looked at."""
-        n = 0
-        for part in self._run.index.parts(self._layer.table, self._windows):
-            n += self._selects or not self._is_inside(part)
-            if n > MAX_COUNTED:
-                return False
-        return True
-
-    def _is_inside(self, part: Part) -> bool:
-        """Whether the windows select all rows of a row group."""
+    def is_inside(self, part: Part) -> bool:
+        """Whether the boxes select all rows of a part."""
         if self._union is None or part.bounds is None:
             return True
-        bounds = self._run.crs.outside(part.bounds, self._query.boxes_crs)
+        bounds = self._search.crs.outside(part.bounds, self._search.boxes_crs)
         return bounds is not None and bool(shapely.covers(self._union, shapely.box(*bounds)))
 
-    def _rows(self, part: Part) -> tuple[npt.NDArray[np.int64], bool]:
-        """The selected rows of a row group, and whether they had to be looked at."""
-        is_inside = self._is_inside(part)
-        if is_inside and not self._selects:
-            return np.arange(part.n), False
-        query = self._query
-        mask = np.ones(part.n, bool)
-        with _reading(self._run, part) as reader:
-            columns = reader.read(self._columns) if self._columns else {}
-            own = reader.geometries() if not is_inside or any(one.is_spatial for one in query.filters) else None
-        if not is_inside and own is not None:
-            mask &= shapely.is_missing(own) | shapely.intersects(self._run.crs.moved(own, query.boxes_crs), self._union)
-        if self._has_times:
-            mask &= _in_time(columns, query.interval)
-        moved = None if own is None else self._run.crs.moved(own, query.filter_crs)
-        for one in query.filters:
-            found = one.mask(Rows(columns, moved, part.n))
-            mask &= np.asarray(pc.fill_null(found, fill_value=False))
-        return np.flatnonzero(mask), True
+    def selected(self, part: Part) -> Sequence[int]:
+        """The positions of the selected rows of a part."""
+        conditions, shapes = list(self._search.conditions), list(self._search.shapes)
+        if not self.is_inside(part):
+            conditions.append(Condition(sql=f"(geometry IS NULL OR shape({len(shapes)}, position))"))
+            shapes.append(
+                ShapeTest(crs=self._search.boxes_crs, test=lambda found: shapely.intersects(found, self._union))
+            )
+        ends = (part.first, part.first + part.n)
+        if not conditions:
+            return range(*ends)
+        source = f"FROM {self._search.table} WHERE position >= ? AND position < ?"
+        if shapes:
+            stored = self._connection.execute(f"SELECT geometry {source} ORDER BY position", ends)
+            own = from_wkb([wkb for (wkb,) in stored])
+            answers = [one.test(self._search.crs.moved(own, one.crs)) for one in shapes]
+            missing = shapely.is_missing(own)
+            self._first = part.first
+            self._answers = [np.where(missing, np.array(None), answer).tolist() for answer in answers]
+        where, values = _joined(conditions)
+        rows = self._connection.execute(f"SELECT position {source} AND {where} ORDER BY position", (*ends, *values))
+        return [position for (position,) in rows]
 
 
-def _in_time(columns: Mapping[str, pa.Array], interval: Interval | None) -> npt.NDArray[np.bool_]:
-    """Rows whose acquisition meets an interval, or is unknown."""
-    first, last = interval or (None, None)
-    begins, ends = (pc.cast(columns[name], pa.timestamp("us", tz="UTC")) for name in _TIMES)
-    mask = np.ones(len(begins), bool)
-    if last is not None:
-        mask &= np.asarray(pc.fill_null(pc.less_equal(begins, pa.scalar(last, begins.type)), fill_value=True))
-    if first is not None:
-        mask &= np.asarray(pc.fill_null(pc.greater_equal(ends, pa.scalar(first, ends.type)), fill_value=True))
-    return mask
+# --- their texts -----------------------------------------------------------------------------------------------------
 
 
-def _features(
-    run: OpenRun, layer: Layer, reader: _Reader, rows: npt.NDArray[np.int64], crs: NamedCrs
+def from_wkb(values: Sequence[bytes | None]) -> Geometries:
+    """Geometries, None where there is none."""
+    return np.asarray(shapely.from_wkb(np.array([*values, None], dtype=object)[:-1]), dtype=object)
+
+
+def geojson(shape: shapely.Geometry | None) -> str:
+    """A geometry as GeoJSON text."""
+    return "null" if shape is None else str(shapely.to_geojson(shape))
+
+
+def feature_texts(
+    index: RowIndex, table: str, positions: Sequence[int], written: Callable[[Geometries], Geometries] | None = None
 ) -> Iterator[bytes]:
-    """The features of some rows of a row group."""
-    columns = reader.read([GEOMETRY, *layer.properties])
-    taken = {name: column.take(pa.array(rows)) for name, column in columns.items()}
-    shapes = run.crs.written(_from_wkb(taken.pop(GEOMETRY)), crs)
-    values = {name: column.to_pylist() for name, column in taken.items()}
-    for number, shape in enumerate(shapes):
-        row = {name: _plain(column[number]) for name, column in values.items()}
-        geometry = b"null" if shape is None else str(shapely.to_geojson(shape)).encode()
-        yield (
-            b'{"type":"Feature","id":'
-            + _json(layer.feature_id(row))
-            + b',"geometry":'
-            + geometry
-            + b',"properties":'
-            + _json(row)
-            + b"}"
-        )
+    """Features as GeoJSON texts, in the order of their positions.
+
+    `written` makes the geometries of answers of those of the run; None for footprints of buildings in degrees, which
+    the index has.
+    """
+    kinds = index.kinds(table)
+    columns = ", ".join(f'"{name}"' for name in kinds)
+    shown = "degrees" if written is None else GEOMETRY
+    with index.opened() as connection:
+        for start in range(0, len(positions), _AT_ONCE):
+            some = positions[start : start + _AT_ONCE]
+            rows = connection.execute(
+                f"SELECT position, id, {shown}, {columns} FROM {table}"  # noqa: S608 - our own words
+                " WHERE position IN (SELECT value FROM json_each(?))",
+                (json.dumps(list(some)),),
+            )
+            found = {row[0]: row[1:] for row in rows}
+            ordered = [found[position] for position in some]
+            shapes = [row[1] or "null" for row in ordered]
+            if written is not None:
+                shapes = list(map(geojson, written(from_wkb([row[1] for row in ordered]))))
+            for (name, _, *values), shape in zip(ordered, shapes, strict=True):
+                head = f'{{"type":"Feature","id":{json.dumps(name)},"geometry":{shape},"properties":'
+                yield head.encode() + _json(properties(kinds, values)) + b"}"
 
 
-def _plain(value: Any) -> Any:
-    return value.isoformat().replace("+00:00", "Z") if isinstance(value, dt.datetime) else value
+def properties(kinds: Mapping[str, str], values: Sequence[Any]) -> dict[str, Any]:
+    """The properties of a feature by their names, from the values of a row."""
+    return {
+        name: value if value is None or kind not in _SHOWN else _SHOWN[kind](value)
+        for (name, kind), value in zip(kinds.items(), values, strict=True)
+    }
+
+
+_SHOWN: Mapping[str, Callable[[Any], Any]] = {
+    "boolean": bool,
+    "list": json.loads,
+    "time": lambda text: text.replace("+00:00", "Z"),
+}
+
+
+def collected(members: Mapping[str, Any], features: Iterator[bytes]) -> Iterator[bytes]:
+    """A feature collection as GeoJSON, piece by piece: the members beside the features, then these, one per line."""
+    yield json.dumps({"type": "FeatureCollection", **members}, ensure_ascii=False).encode()[:-1] + b',"features":['
+    between = b"\n"
+    for text in features:
+        yield between + text
+        between = b",\n"
+    yield b"\n]}\n"
 
 
 def _json(value: Any) -> bytes:

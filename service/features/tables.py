@@ -1,41 +1,24 @@
-"""The tables of a served run: what their columns are for clients, and the run opened for reading."""
+"""The tables of a run as collections: what their columns are for clients."""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
-import itertools
-import logging
-import threading
-import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import pyarrow as pa
-import pyarrow.fs as pafs
 
-from pipeline.errors import RunError, causes
 from pipeline.export.columns import COLUMNS, HORIZONTAL, NONE, VERTICAL
 from pipeline.export.records import SCHEMAS
 from pipeline.export.solid_geometry import SHAPE_COLUMNS
-from pipeline.io import arrow_at, is_url
 from pipeline.io.crs_units import unit_name
 from pipeline.model import Reason, RoofType, Status
-from pipeline.runtime.manifest import NAME as MANIFEST_NAME
-from pipeline.runtime.manifest import RunStatus
-from pipeline.runtime.manifest_reading import read_manifest
-from service.errors import NoSuchCollectionError, ResultNotReadyError, StartUpError
-from service.features.coordinates import CollectionCrs
-from service.features.row_index import RowIndex, Totals, write_index
-from service.features.runs import TABLES, ServedRun, version_of
+from service.features.coordinates import RunCrs
+from service.features.index import TABLES
 
 GEOMETRY = "geometry"
 TILE = "tile"
-
-_log = logging.getLogger("gablework.service")
-_TRUST_S = 5.0
-"""Seconds for which a run at a URL is not asked whether it changed."""
-_OPEN_RUNS = 64
 
 _WORDS: Mapping[tuple[str, str], type[Status | RoofType | Reason]] = {
     ("buildings", "status"): Status,
@@ -73,15 +56,9 @@ class Layer:
         return fields | {TILE: pa.string()}
 
     @functools.cached_property
-    def queryables(self) -> Mapping[str, str]:
-        """The properties that filters can name, with their kinds: text, number, boolean or time."""
-        kinds = {name: kind_of(kind) for name, kind in self.properties.items()}
-        return {name: kind for name, kind in kinds.items() if kind}
-
-    @property
-    def has_times(self) -> bool:
-        """Whether features have a time of acquisition."""
-        return "acquired_from" in self.properties
+    def kinds(self) -> Mapping[str, str]:
+        """The kinds of these properties: text, number, boolean, time or list."""
+        return {name: kind_of(kind) for name, kind in self.properties.items()}
 
     def feature_id(self, row: Mapping[str, Any]) -> str:
         """The id of a row's feature: that of the object; a plane has its building's, a dot and its own number."""
@@ -89,13 +66,13 @@ class Layer:
             return f"{row['building_id']}.{row['plane_id']}"
         return str(row["object_id" if self.table == "rejected" else "building_id"])
 
-    def filter_schema(self, crs: CollectionCrs) -> dict[str, Any]:
+    def filter_schema(self, crs: RunCrs) -> dict[str, Any]:
         """The JSON schemas of the properties that filters can name, and of the geometry."""
-        found = {name: self._property(name, crs) for name in self.queryables}
+        found = {name: self._property(name, crs) for name, kind in self.kinds.items() if kind != "list"}
         role = {"x-ogc-role": "primary-geometry", "format": "geometry-polygon-or-multipolygon"}
         return {**found, GEOMETRY: {"title": GEOMETRY, **role}}
 
-    def feature_schema(self, crs: CollectionCrs) -> dict[str, Any]:
+    def feature_schema(self, crs: RunCrs) -> dict[str, Any]:
         """The JSON schemas of the members of a feature.
 
         Types are single words with `nullable`, as in OpenAPI 3.0: GDAL takes a list of types for a text. For the same
@@ -111,10 +88,10 @@ class Layer:
             "properties": {"type": "object", "properties": found, "required": listed},
         }
 
-    def _property(self, name: str, crs: CollectionCrs) -> dict[str, Any]:
+    def _property(self, name: str, crs: RunCrs) -> dict[str, Any]:
         """The JSON schema of a property; of a coordinate with its unit as UCUM (OGC API - Features, part 5)."""
         found = {"title": name, **json_type(self.properties[name])}
-        own = {HORIZONTAL: crs.horizontal_unit_m, VERTICAL: crs.vertical_unit_m}
+        own = {HORIZONTAL: crs.horizontal_unit_m, VERTICAL: crs.vertical_unit_m or 1.0}
         unit_m = own.get(_UNITS[self.table].get(name, NONE))
         if unit_m is not None:
             found["x-ogc-unit"] = ucum(unit_m)
@@ -138,10 +115,10 @@ LAYERS: Mapping[str, Layer] = {table: Layer(table) for table in TABLES}
 
 
 def kind_of(kind: pa.DataType) -> str:
-    """The kind of a type that filters compare; an empty text for lists.
+    """The kind of a type; filters compare all but lists.
 
     >>> kind_of(pa.int32()), kind_of(pa.timestamp("us", tz="UTC")), kind_of(pa.list_(pa.int32()))
-    ('number', 'time', '')
+    ('number', 'time', 'list')
     """
     if pa.types.is_string(kind):
         return "text"
@@ -149,7 +126,7 @@ def kind_of(kind: pa.DataType) -> str:
         return "boolean"
     if pa.types.is_timestamp(kind):
         return "time"
-    return "number" if pa.types.is_integer(kind) or pa.types.is_floating(kind) else ""
+    return "number" if pa.types.is_integer(kind) or pa.types.is_floating(kind) else "list"
 
 
 def _is_float_list(kind: pa.DataType) -> bool:
@@ -169,116 +146,3 @@ def json_type(kind: pa.DataType) -> dict[str, Any]:
     words = {"text": "string", "time": "string", "boolean": "boolean", "number": "number"}
     found = {"type": words[kind_of(kind)]}
     return found | {"format": "date-time"} if kind_of(kind) == "time" else found
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class OpenRun:
-    """A served run, ready to be read."""
-
-    run: ServedRun
-    """The run."""
-    filesystem: pafs.FileSystem
-    """Where it lies."""
-    version: str
-    """Differs for another state of the run."""
-    crs: CollectionCrs
-    """Its CRS, and those of answers."""
-    licence: str | None
-    """Licence of its source data."""
-    index: RowIndex
-    """Where its rows are."""
-
-    @functools.lru_cache(maxsize=256)  # noqa: B019 - runs are few and kept anyway
-    def totals(self, table: str) -> Totals:
-        """Facts about a whole table."""
-        return self.index.totals(table)
-
-    __hash__ = object.__hash__
-
-
-_open: dict[tuple[str, str], tuple[float, tuple[Any, ...], OpenRun]] = {}
-_locks: dict[str, threading.Lock] = {}
-_guard = threading.Lock()
-
-
-def open_run(run: ServedRun) -> OpenRun:
-    """Open a run. Its index is made if there is none for its present state.
-
-    Raises
-    ------
-    NoSuchCollectionError
-        Its CRS is unknown, or it cannot be read.
-    ResultNotReadyError
-        A published run is not finished, or is being replaced.
-    """
-    key = (run.name, run.place)
-    with _guard:
-        lock = _locks.setdefault("\n".join(key), threading.Lock())
-    with lock:
-        held = _open.get(key)
-        now_s = time.monotonic()
-        if held is not None and (run.is_job or (is_url(run.place) and now_s - held[0] < _TRUST_S)):
-            return held[2]
-        try:
-            filesystem, place = arrow_at(run.place)
-            info = filesystem.get_file_info(f"{place.rstrip('/')}/{MANIFEST_NAME}")
-            state = (info.mtime_ns, info.size)
-            opened = held[2] if held is not None and held[1] == state else _opened(run, filesystem, place, state)
-        except (RunError, OSError, pa.ArrowException) as error:
-            raise unreadable(run, error) from error
-        with _guard:
-            _open[key] = (now_s, state, opened)
-            for old in list(_open)[:-_OPEN_RUNS]:
-                del _open[old]
-        return opened
-
-
-def _opened(run: ServedRun, filesystem: pafs.FileSystem, place: str, state: tuple[Any, ...]) -> OpenRun:
-    manifest = read_manifest(place, filesystem)
-    if not run.is_job and manifest.status is not RunStatus.FINISHED:
-        raise ResultNotReadyError(
-            f"run {run.name} is {manifest.status.value}, not finished: complete it, or wait until it is replaced"
-        )
-    crs = CollectionCrs(manifest.crs, run.name)
-    version = version_of(run.place, manifest.content_sha256, manifest.finished_at, *state)
-    path = run.index_dir / f"{run.name}-{version}.sqlite"
-    if not path.is_file():
-        write_index(path, place, filesystem)
-        for old in path.parent.glob(f"{run.name}-{'?' * len(version)}.sqlite"):
-            if old != path:
-                old.unlink(missing_ok=True)
-    return OpenRun(
-        run=run,
-        filesystem=filesystem,
-        version=version,
-        crs=crs,
-        licence=manifest.source_licence or None,
-        index=RowIndex(path),
-    )
-
-
-def unreadable(run: ServedRun, error: Exception) -> NoSuchCollectionError:
-    """The error for a run whose files are gone or damaged. The log has the cause, since it can name a folder."""
-    _log.warning("run %s at %s cannot be read: %s", run.name, run.place, error)
-    return NoSuchCollectionError(f"files of run {run.name} are gone or damaged; the log of the service says which")
-
-
-def check_published(runs: Mapping[str, ServedRun]) -> None:
-    """Read each published run once, and make its index.
-
-    Raises
-    ------
-    StartUpError
-        One is not a finished run, or its coordinate reference system is unknown.
-    """
-    for run in runs.values():
-        try:
-            open_run(run)
-        except (NoSuchCollectionError, ResultNotReadyError) as error:
-            behind = next(itertools.islice(causes(error), 1, None), error)
-            raise StartUpError(f"the run {run.place} cannot be published: {behind}") from error
-
-
-def layers() -> Iterator[Layer]:
-    """The tables that are collections, in their order."""
-    yield from LAYERS.values()

@@ -1,4 +1,4 @@
-"""Assembles the outputs of a finished run: one pass over its tiles, one tile in memory at a time."""
+"""Assembles the outputs of a finished run, each by a function of its own, with one tile in memory at a time."""
 
 from __future__ import annotations
 
@@ -6,27 +6,29 @@ import contextlib
 import dataclasses
 import json
 import zipfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.export.folders import POINTS_FOLDER
-from pipeline.export.point_files import TILESET
-from service.outputs.catalogue import NAME as CATALOGUE_NAME
-from service.outputs.catalogue import Catalogue, StoredOutput
-from service.outputs.kinds import ON_REQUEST, OUTPUTS, chosen
+from pipeline.export.folders import POINTS_FOLDER, TERRAIN_FOLDER
+from pipeline.extras.octree.point_files import TILESET
+from pipeline.io.storage import LocalStorage
+from service.features.index import NAME as INDEX_NAME
+from service.features.index import RowIndex
+from service.outputs.catalogue import Catalogue, ResultsCrs, stored_outputs
+from service.outputs.files import write_moved_tileset, zip_files
+from service.outputs.kinds import OUTPUTS, chosen
 
 if TYPE_CHECKING:
-    from service.outputs.building_index import BuildingIndexFile
-    from service.outputs.footprints import FeatureCollectionFile, Wgs84Transformation
-    from service.outputs.merged_cityjson import MergedCityJson
-    from service.outputs.merged_table import MergedTable
-    from service.outputs.report import Tally
+    from service.features.coordinates import RunCrs
 
 Progress = Callable[[int, int], None]
-"""Gets the number of finished tiles and of all tiles. An exception from it ends the work and leaves no partial file."""
+"""Gets how much is done, and of how much. An exception from it ends the work and leaves no file."""
 
-_TABLES = ("buildings", "planes", "rejected")
+_UNKNOWN = (
+    "The coordinate reference system of the tiles is unknown or local: these coordinates are theirs, not WGS 84. "
+    "Give `crs` with the job to get degrees."
+)
 
 
 def _nothing(done: int, total: int) -> None:
@@ -43,21 +45,6 @@ class RunTile:
     """Its files, relative to the run directory."""
 
     @property
-    def cityjson(self) -> str:
-        """Its CityJSONSeq file."""
-        return f"cityjson/tile={self.key}/part-0.city.jsonl"
-
-    def table(self, name: str) -> str:
-        """Its file of a table."""
-        return f"{name}/tile={self.key}/part-0.parquet"
-
-    @property
-    def decisions(self) -> str | None:
-        """Its file of decisions; None in a run that recorded none."""
-        name = self.table("decisions")
-        return name if name in self.files else None
-
-    @property
     def meshes(self) -> list[str]:
         """Its OBJ files, by name."""
         return sorted(name for name in self.files if name.startswith("meshes/"))
@@ -66,10 +53,9 @@ class RunTile:
 def write_outputs(
     run_dir: Path, out_dir: Path, wanted: Sequence[str] | None = None, on_progress: Progress = _nothing
 ) -> None:
-    """Write the outputs of a finished run, and the index of its buildings.
+    """Write the outputs of a finished run, and its index.
 
-    Every file gets its name when it is complete, and the catalogue comes last. Writing again gives the same bytes. One
-    tile is in memory at a time.
+    The files get their names when all are complete, and the catalogue comes last. Writing again gives the same bytes.
 
     Parameters
     ----------
@@ -78,10 +64,9 @@ def write_outputs(
     out_dir : Path
         Folder to write into; made if it is missing.
     wanted : sequence of str, optional
-        Ids of `OUTPUTS`; all by default. The file of features and the index are always written: the service needs
-        them for single buildings. Those of `ON_REQUEST` count if their files are there.
+        Ids of `OUTPUTS`; all by default. Those of `ON_REQUEST` count if their files are there.
     on_progress : callable
-        Gets the number of finished tiles and of all tiles.
+        Gets how much is done, and of how much.
 
     Raises
     ------
@@ -92,76 +77,47 @@ def write_outputs(
     OSError
         The folder cannot be written.
     """
-    from pipeline.io.storage import LocalStorage, sha256_of
-    from service.outputs.footprints import Wgs84Transformation
-    from service.outputs.report import report, report_bytes
+    from pyarrow.fs import LocalFileSystem
 
-    names = {kind.output_id for kind in chosen(wanted)}
-    manifest = _manifest(run_dir)
+    from pipeline.errors import RunError
+    from pipeline.runtime.manifest import NAME as MANIFEST
+    from pipeline.runtime.manifest import RunStatus
+    from pipeline.runtime.manifest_reading import read_manifest
+    from service.features.coordinates import RunCrs
+    from service.features.writing import write_index
+
+    kinds = chosen(wanted)
+    known = read_manifest(run_dir)
+    if known.status not in {RunStatus.FINISHED, RunStatus.INCOMPLETE}:
+        raise RunError(f"{run_dir} is {known.status.value}: outputs need a finished run")
     tiles, failed_tiles = published_tiles(run_dir)
-    to_wgs84 = Wgs84Transformation.of_run(manifest["crs"])
     storage = LocalStorage(root=out_dir)
     with contextlib.ExitStack() as stack:
-        sinks = _Sinks(stack, storage, run_dir, tiles, names, to_wgs84)
-        for done, tile in enumerate(tiles):
-            on_progress(done, len(tiles))
-            sinks.add(tile)
-        tally = sinks.tally
-    on_progress(len(tiles), len(tiles))
-    if "report" in names:
-        found = report(manifest, tally, to_wgs84.crs, failed_tiles, run_dir)
-        storage.put(OUTPUTS["report"].filename, report_bytes(found))
-    if tally.modelled and not any(tile.meshes for tile in tiles):
-        # the run was requested without meshes
-        names.discard("meshes")
-        (out_dir / OUTPUTS["meshes"].filename).unlink(missing_ok=True)
-    if not ("tileset" in names and _write_tileset(run_dir, out_dir / OUTPUTS["tileset"].filename)):
-        # the request left out the points
-        names.discard("tileset")
-        (out_dir / OUTPUTS["tileset"].filename).unlink(missing_ok=True)
-    # these were written before, those that the request named
-    names -= {name for name in names & ON_REQUEST if not (out_dir / OUTPUTS[name].filename).is_file()}
-    stored = {}
-    for kind in chosen(names):
-        path = out_dir / kind.filename
-        stored[kind.output_id] = StoredOutput(size_bytes=path.stat().st_size, sha256=sha256_of(path))
-    catalogue = Catalogue(outputs=stored, crs=to_wgs84.crs, n_buildings=tally.buildings)
-    storage.put(CATALOGUE_NAME, catalogue.to_json().encode())
-
-
-def _write_tileset(run_dir: Path, path: Path) -> bool:
-    """Write the root tileset of the points for its place among the results; False if there is none."""
-    root = run_dir / POINTS_FOLDER / TILESET
-    if not root.is_file():
-        return False
-    tileset = json.loads(root.read_bytes())
-    waiting = [tileset["root"]]
-    for node in waiting:
-        if "content" in node:
-            # from jobs/ID/results/tileset to jobs/ID/points
-            node["content"]["uri"] = f"../points/{node['content']['uri']}"
-        waiting.extend(node.get("children", ()))
-    path.write_text(json.dumps(tileset, separators=(",", ":"), ensure_ascii=False), encoding="utf-8")
-    return True
-
-
-def _manifest(run_dir: Path) -> Mapping[str, Any]:
-    """The content of run.json of a finished run.
-
-    Raises
-    ------
-    RunError
-        The run did not end, or does not exist.
-    """
-    from pipeline.errors import RunError
-    from pipeline.runtime.manifest import NAME, RunStatus
-    from pipeline.runtime.manifest_reading import read_manifest
-
-    status = read_manifest(run_dir).status
-    if status not in {RunStatus.FINISHED, RunStatus.INCOMPLETE}:
-        raise RunError(f"{run_dir} is {status.value}: outputs need a finished run")
-    found: Mapping[str, Any] = json.loads((run_dir / NAME).read_text(encoding="utf-8"))
-    return found
+        path = stack.enter_context(storage.putting(INDEX_NAME))
+        work = _Work(
+            run_dir=run_dir,
+            tiles=tiles,
+            failed_tiles=failed_tiles,
+            manifest=json.loads((run_dir / MANIFEST).read_text(encoding="utf-8")),
+            crs=RunCrs.of_run(known.crs),
+            index=RowIndex(path),
+            total=len(tiles) * (1 + sum(kind.output_id in _BY_TILE for kind in kinds)),
+            on_progress=on_progress,
+        )
+        write_index(path, str(run_dir), LocalFileSystem(), known, (tile.key for tile in work.each()))
+        absent = work.absent()
+        for kind in kinds:
+            if kind.output_id in _WRITERS and kind.output_id not in absent:
+                _WRITERS[kind.output_id](work, stack.enter_context(storage.putting(kind.filename)), kind.output_id)
+        n_buildings = work.index.totals("buildings").n
+    on_progress(work.total, work.total)
+    for name in absent:
+        (out_dir / OUTPUTS[name].filename).unlink(missing_ok=True)
+    # those on request were written before
+    there = [kind for kind in kinds if (out_dir / kind.filename).is_file()]
+    Catalogue(outputs=stored_outputs(out_dir, there), crs=ResultsCrs.of(work.crs), n_buildings=n_buildings).write(
+        out_dir
+    )
 
 
 def published_tiles(run_dir: Path) -> tuple[list[RunTile], dict[str, str]]:
@@ -169,124 +125,108 @@ def published_tiles(run_dir: Path) -> tuple[list[RunTile], dict[str, str]]:
 
     A tile writes its state last, so the files that the state lists exist.
     """
-    tiles, failed = [], {}
+    from service.features.writing import in_z_order
+
+    tiles, failed = {}, {}
     for path in (run_dir / "state").glob("*.json"):
         state = json.loads(path.read_text(encoding="utf-8"))
         if state["state"] != "done":
             failed[state["tile"]] = state["error"]
         elif state["files"]:
-            tiles.append(RunTile(key=state["tile"], files=tuple(state["files"])))
-    return sorted(tiles, key=lambda tile: (z_order(tile.key), tile.key)), failed
+            tiles[state["tile"]] = RunTile(key=state["tile"], files=tuple(state["files"]))
+    return [tiles[key] for key in in_z_order(tiles)], failed
 
 
-def z_order(tile_key: str) -> int:
-    """Position of a tile on the Z-order curve: successive rows of a file are near each other.
+@dataclasses.dataclass(kw_only=True)
+class _Work:
+    """A run whose outputs are written."""
 
-    Examples
-    --------
-    >>> sorted(["x0_y1", "x1_y1", "x1_y0", "x0_y0", "x-1_y0"], key=z_order)
-    ['x-1_y0', 'x0_y0', 'x1_y0', 'x0_y1', 'x1_y1']
-    """
-    column, _, row = tile_key.removeprefix("x").partition("_y")
-    # lattices lie far within 2^31 tiles of their origin
-    x, y = int(column) + 2**31, int(row) + 2**31
-    return sum(((x >> bit & 1) << (2 * bit)) | ((y >> bit & 1) << (2 * bit + 1)) for bit in range(33))
+    run_dir: Path
+    tiles: Sequence[RunTile]
+    failed_tiles: Mapping[str, str]
+    manifest: Mapping[str, Any]
+    crs: RunCrs
+    index: RowIndex
+    total: int
+    on_progress: Progress
+    done: int = 0
+
+    def each(self) -> Iterator[RunTile]:
+        """The tiles, whose number is reported."""
+        for tile in self.tiles:
+            self.on_progress(self.done, self.total)
+            yield tile
+            self.done += 1
+
+    def file(self, folder: str, tile: RunTile, name: str) -> Path:
+        """A file of a tile."""
+        return self.run_dir / folder / f"tile={tile.key}" / name
+
+    def absent(self) -> list[str]:
+        """Outputs for which the request of the run left out the files."""
+        has_models = self.index.figure("SELECT count(*) FROM buildings WHERE lod IS NOT NULL")
+        has_points = (self.run_dir / POINTS_FOLDER / TILESET).is_file()
+        lacks_meshes = has_models and not any(tile.meshes for tile in self.tiles)
+        return [*(["meshes"] if lacks_meshes else []), *([] if has_points else ["tileset"])]
 
 
-class _Sinks:
-    """The files that one pass over the tiles writes."""
+def _table(work: _Work, path: Path, name: str) -> None:
+    from service.outputs.merged_table import merge_tables, united_metadata
 
-    def __init__(
-        self,
-        stack: contextlib.ExitStack,
-        storage: Any,
-        run_dir: Path,
-        tiles: Sequence[RunTile],
-        names: set[str],
-        to_wgs84: Wgs84Transformation,
-    ) -> None:
-        from service.outputs.building_index import NAME as INDEX_NAME
-        from service.outputs.building_index import BuildingIndexFile
-        from service.outputs.footprints import FeatureCollectionFile
-        from service.outputs.merged_cityjson import MergedCityJson, read_header
-        from service.outputs.merged_table import MergedTable
-        from service.outputs.report import Tally
+    part = "part-0.parquet"
+    projjson = None if work.crs.whole is None else work.crs.whole.to_json_dict()
+    geo = united_metadata(name, (work.file(name, tile, part) for tile in work.tiles), projjson)
+    merge_tables(path, name, ((tile.key, work.file(name, tile, part)) for tile in work.each()), geo)
 
-        def file(name: str) -> Path:
-            path: Path = stack.enter_context(storage.putting(name))
-            return path
 
-        self._run_dir = run_dir
-        self._to_wgs84 = to_wgs84
-        self.tally: Tally = Tally()
-        self._headers = {tile.key: read_header(run_dir / tile.cityjson) for tile in tiles}
-        self._tables: dict[str, MergedTable] = {}
-        for name in _TABLES:
-            if name in names:
-                sources = [run_dir / tile.table(name) for tile in tiles]
-                self._tables[name] = stack.enter_context(
-                    MergedTable(file(OUTPUTS[name].filename), name, sources, to_wgs84.projjson)
-                )
-        self._city: MergedCityJson | None = None
-        if "cityjson" in names:
-            stream = stack.enter_context(file(OUTPUTS["cityjson"].filename).open("wb"))
-            self._city = MergedCityJson(stream, list(self._headers.values()))
-        self._archive: zipfile.ZipFile | None = None
-        if "meshes" in names:
-            self._archive = stack.enter_context(zipfile.ZipFile(file(OUTPUTS["meshes"].filename), "w"))
-        self._index: BuildingIndexFile = stack.enter_context(BuildingIndexFile(file(INDEX_NAME)))
-        stream = stack.enter_context(file(OUTPUTS["geojson"].filename).open("wb"))
-        self._features: FeatureCollectionFile = stack.enter_context(
-            contextlib.closing(FeatureCollectionFile(stream, to_wgs84.crs))
-        )
+def _cityjson(work: _Work, path: Path, name: str) -> None:
+    from service.outputs.merged_cityjson import merge_cityjson
 
-    def add(self, tile: RunTile) -> None:
-        """Write one tile to all files."""
-        from pipeline.export.folders import TERRAIN_FOLDER
-        from pipeline.export.solid_geometry import SHAPE_COLUMNS
-        from service.outputs.footprints import feature_texts
-        from service.outputs.merged_table import read_tile
-        from service.outputs.meshes import zip_files
+    part = "part-0.city.jsonl"
+    sources = [work.file(name, tile, part) for tile in work.tiles]
+    merge_cityjson(path, sources, (work.file(name, tile, part) for tile in work.each()))
 
-        tables = {name: read_tile(self._run_dir / tile.table(name)) for name in _TABLES}
-        for name, table in self._tables.items():
-            table.add(tile.key, tables[name])
-        if self._archive is not None:
-            terrain = sorted((self._run_dir / TERRAIN_FOLDER / f"tile={tile.key}").glob("part-*"))
-            names = [path.relative_to(self._run_dir).as_posix() for path in terrain]
-            zip_files(self._archive, self._run_dir, [*tile.meshes, *names])
-        places = self._add_cityjson(tile)
-        planes: dict[str, list[dict[str, Any]]] = {}
-        for plane in tables["planes"].drop_columns(["geometry", "bbox"]).to_pylist():
-            planes.setdefault(plane.pop("building_id"), []).append(plane)
-            self.tally.planes += 1
-        decisions: dict[str, list[dict[str, Any]]] = {}
-        if tile.decisions is not None:
-            for entry in read_tile(self._run_dir / tile.decisions).to_pylist():
-                decisions.setdefault(entry.pop("building_id"), []).append(entry)
-        self.tally.count_rejected(tables["rejected"].column("reason").to_pylist())
-        rows = [{**row, "tile": tile.key} for row in tables["buildings"].drop_columns(list(SHAPE_COLUMNS)).to_pylist()]
-        for feature in feature_texts(rows, self._to_wgs84):
-            start = self._features.add(feature)
-            self._index.add(
-                record=feature.record,
-                feature=(start, len(feature.text), feature.geometry_start, feature.geometry_size),
-                native=feature.native,
-                city=places[feature.building_id],
-                planes=planes.get(feature.building_id, ()),
-                decisions=decisions.get(feature.building_id, ()),
-                bounds=feature.bounds,
-                bounds_deg=feature.bounds_deg,
-            )
-            self.tally.count_building(feature.record, has_geometry=feature.bounds_deg is not None)
 
-    def _add_cityjson(self, tile: RunTile) -> dict[str, tuple[int, int]]:
-        """Write the tile's features; start and size of each building's line in the tile's own file."""
-        from service.outputs.merged_cityjson import features
+def _meshes(work: _Work, path: Path, _: str) -> None:
+    with zipfile.ZipFile(path, "w") as archive:
+        for tile in work.each():
+            terrain = sorted((work.run_dir / TERRAIN_FOLDER / f"tile={tile.key}").glob("part-*"))
+            names = [found.relative_to(work.run_dir).as_posix() for found in terrain]
+            zip_files(archive, work.run_dir, [*tile.meshes, *names])
 
-        places = {}
-        for place, line in features(self._run_dir / tile.cityjson):
-            places[place.building_id] = (place.start, place.size)
-            if self._city is not None:
-                self._city.add(self._headers[tile.key], line)
-        return places
+
+def _tileset(work: _Work, path: Path, _: str) -> None:
+    # from jobs/ID/results/tileset to jobs/ID/points
+    write_moved_tileset(work.run_dir / POINTS_FOLDER / TILESET, path, "../points")
+
+
+def _geojson(work: _Work, path: Path, _: str) -> None:
+    """Write the footprints of all buildings, in degrees if their CRS is known."""
+    from service.features.pages import collected, feature_texts
+
+    members: dict[str, Any] = {} if work.crs.is_known else {"coordRefSys": None, "note": _UNKNOWN}
+    if work.crs.vertical_unit_m is not None:
+        members["verticalUnitM"] = work.crs.vertical_unit_m
+    positions = range(work.index.totals("buildings").n)
+    texts = feature_texts(work.index, "buildings", positions, None if work.crs.is_known else lambda shapes: shapes)
+    with path.open("wb") as stream:
+        stream.writelines(collected(members, texts))
+
+
+def _report(work: _Work, path: Path, _: str) -> None:
+    from service.outputs.report import report
+
+    found = report(work.manifest, work.index, ResultsCrs.of(work.crs), work.failed_tiles, work.run_dir)
+    text = json.dumps(found, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    path.write_text(text, encoding="utf-8")
+
+
+_BY_TILE: Mapping[str, Callable[[_Work, Path, str], None]] = {
+    "buildings": _table,
+    "planes": _table,
+    "rejected": _table,
+    "meshes": _meshes,
+    "cityjson": _cityjson,
+}
+_WRITERS = {**_BY_TILE, "tileset": _tileset, "geojson": _geojson, "report": _report}
+"""The functions that write outputs, by their ids; those that are made on request are written by `published`."""

@@ -1,7 +1,7 @@
-"""The buildings of a run that goes on, in the form of the outputs: the same index, features and CityJSON files.
+"""The buildings of a run that goes on: an index that grows, and a file with their city objects.
 
-The files of features and of CityJSON only grow. The index comes after them and says what is there, so readers never
-see half a building. The next writer of the same folder cuts off what the index does not know.
+The file only grows. The index comes after it and says what is there, so readers never see half a building. The next
+writer of the same folder cuts off what the index does not know.
 """
 
 from __future__ import annotations
@@ -9,21 +9,19 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, BinaryIO, Self
+from typing import Any, Self
 
 from pipeline.export.facts import RecordContext
 from pipeline.export.records import plane_rows
 from pipeline.export.tile import building_rows, city_lines
-from pipeline.io.storage import LocalStorage
 from pipeline.runtime.stages.model_batch import StoredResult
-from service.outputs.building_index import FEATURES_NAME, NAME, GrowingIndexFile
-from service.outputs.catalogue import NAME as CATALOGUE_NAME
-from service.outputs.catalogue import Catalogue
-from service.outputs.footprints import Wgs84Transformation, feature_texts
-from service.outputs.single_building import cityjson_path
+from service.features.index import NAME
+from service.features.writing import GrowingIndex
+from service.outputs.catalogue import Catalogue, ResultsCrs
+from service.outputs.single_building import SO_FAR_CITY
 
 
 class BuildingsSoFar:
@@ -42,27 +40,19 @@ class BuildingsSoFar:
     def __init__(self, folder: Path, context: RecordContext, crs: Mapping[str, Any] | None) -> None:
         self._folder = folder
         self._context = context
-        self._to_wgs84 = Wgs84Transformation.of_run(crs)
+        self._crs = crs
         self._stack = ExitStack()
-        self._corners: dict[str, list[float]] = {}
         folder.mkdir(exist_ok=True)
 
     def __enter__(self) -> Self:
         """Open the files, and cut off what the index does not know."""
-        self._index = self._stack.enter_context(GrowingIndexFile(self._folder / NAME))
+        self._index = self._stack.enter_context(GrowingIndex(self._folder / NAME, self._crs))
         self.batches = self._index.batches
         """Names of the batches that are there."""
-        sizes = self._index.city_sizes
-        for path in self._folder.glob("cityjson/*/*"):
-            tile = path.parent.name.removeprefix("tile=")
-            if tile in sizes:
-                os.truncate(path, sizes[tile])
-            else:
-                path.unlink()
-        features = self._folder / FEATURES_NAME
-        features.touch()
-        os.truncate(features, self._index.features_size)
-        self._features = self._stack.enter_context(features.open("ab"))
+        city = self._folder / SO_FAR_CITY
+        city.touch()
+        os.truncate(city, self._index.figure("SELECT coalesce(max(start + size), 0) FROM city"))
+        self._city = self._stack.enter_context(city.open("ab"))
         return self
 
     def __exit__(self, *raised: object) -> None:
@@ -76,59 +66,20 @@ class BuildingsSoFar:
         context = dataclasses.replace(self._context, facts=facts)
         # meshes are written only when the whole tile is published
         rows = building_rows(results, context, tile, "none")
-        with self._city_file(tile) as stream:
-            lines = city_lines(results, rows, context, f"buildings of tile {tile}", self._corners.get(tile))
-            places = self._add_city(tile, stream, lines)
-        for result, feature in zip(
-            results, feature_texts([{**row, "tile": tile} for row in rows], self._to_wgs84), strict=True
-        ):
-            start = self._features.tell()
-            self._features.write(feature.text + b"\n")
-            self._index.add(
-                record=feature.record,
-                feature=(start, len(feature.text), feature.geometry_start, feature.geometry_size),
-                native=feature.native,
-                city=places[feature.building_id],
-                planes=[_without_shape(row) for row in plane_rows(result, context)],
-                decisions=(),
-                bounds=feature.bounds,
-                bounds_deg=feature.bounds_deg,
-            )
-        self._index.add_batch(batch)
+        header, *lines = city_lines(results, rows, context, f"buildings of tile {tile}")
+        for line in lines:
+            text = f"{header}\n{line}\n".encode()
+            place = (json.loads(line)["id"], self._city.tell(), len(text))
+            self._index.connection.execute("INSERT INTO city VALUES (?,?,?)", place)
+            self._city.write(text)
+        self._index.add("buildings", tile, rows)
+        self._index.add("planes", tile, [row for result in results for row in plane_rows(result, context)])
+        self._index.connection.execute("INSERT INTO batch VALUES (?)", (batch,))
         self.batches.add(batch)
 
     def show(self) -> None:
         """Let readers see what was added since."""
-        self._features.flush()
+        self._city.flush()
         self._index.show()
-        catalogue = Catalogue(outputs={}, crs=self._to_wgs84.crs, n_buildings=self._index.n_buildings)
-        LocalStorage(root=self._folder).put(CATALOGUE_NAME, catalogue.to_json().encode())
-
-    @contextmanager
-    def _city_file(self, tile: str) -> Iterator[BinaryIO]:
-        path = cityjson_path(self._folder, tile)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("a+b") as stream:
-            if stream.tell() and tile not in self._corners:
-                stream.seek(0)
-                self._corners[tile] = json.loads(stream.readline())["transform"]["translate"]
-                stream.seek(0, os.SEEK_END)
-            yield stream
-
-    def _add_city(self, tile: str, stream: BinaryIO, lines: Iterator[str]) -> dict[str, tuple[int, int]]:
-        """Append features to a tile's file; start and size of each building's line."""
-        header = next(lines)
-        if tile not in self._corners:
-            self._corners[tile] = json.loads(header)["transform"]["translate"]
-            stream.write(f"{header}\n".encode())
-        places = {}
-        for line in lines:
-            text = line.encode()
-            places[json.loads(line)["id"]] = (stream.tell(), len(text))
-            stream.write(text + b"\n")
-        return places
-
-
-def _without_shape(row: dict[str, Any]) -> dict[str, Any]:
-    """A row of the table of planes as the outputs have it with the building."""
-    return {name: value for name, value in row.items() if name not in {"geometry", "building_id"}}
+        count = self._index.figure("SELECT count(*) FROM buildings")
+        Catalogue(outputs={}, crs=ResultsCrs.of(self._index.crs), n_buildings=count).write(self._folder)

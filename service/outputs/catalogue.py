@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from service.errors import NoSuchOutputError
-from service.outputs.kinds import KINDS, OUTPUTS
+from service.outputs.kinds import KINDS, OUTPUTS, OutputKind
+
+if TYPE_CHECKING:
+    from service.features.coordinates import RunCrs
 
 NAME = "outputs.json"
 """File name of the catalogue; a folder without it is not finished."""
@@ -29,21 +32,28 @@ class StoredOutput:
 class ResultsCrs:
     """The coordinate reference system (CRS) of the results."""
 
-    name: str | None
+    name: str | None = None
     """Name as in the run; None if unknown."""
-    uri: str | None
+    uri: str | None = None
     """URI of its horizontal part at the OGC; None without an EPSG code."""
-    to_wgs84: str | None
+    to_wgs84: str | None = None
     """PROJ's description of the transformation to WGS 84; None if the CRS is unknown."""
-    accuracy_m: float | None
+    accuracy_m: float | None = None
     """Accuracy of that transformation in metres; None if PROJ gives none."""
     vertical_unit_m: float | None = None
     """Metres per unit of the columns that are elevations; None if unknown, as in older results."""
 
     @classmethod
-    def unknown(cls) -> ResultsCrs:
-        """That of results without coordinates of their own."""
-        return cls(name=None, uri=None, to_wgs84=None, accuracy_m=None)
+    def of(cls, crs: RunCrs) -> ResultsCrs:
+        """That of a run."""
+        accuracy_m = None if crs.to_degrees is None else crs.to_degrees.accuracy
+        return cls(
+            name=crs.name,
+            uri=crs.storage_uri,
+            to_wgs84=None if crs.to_degrees is None else crs.to_degrees.description,
+            accuracy_m=None if accuracy_m is None or accuracy_m < 0 else float(accuracy_m),
+            vertical_unit_m=crs.vertical_unit_m,
+        )
 
     @property
     def is_known(self) -> bool:
@@ -57,20 +67,23 @@ class Catalogue:
 
     outputs: Mapping[str, StoredOutput]
     """By id, in the order of the process's table."""
-    crs: ResultsCrs
-    """The CRS of the results."""
-    n_buildings: int
+    crs: ResultsCrs = ResultsCrs()
+    """The CRS of the results; unknown for results without coordinates of their own."""
+    n_buildings: int = 0
     """Rows of the buildings table."""
     runs: tuple[str, ...] = ()
     """Labels of the runs of a comparison, each with its own folder of outputs; empty otherwise."""
 
-    def to_json(self) -> str:
-        """The catalogue as JSON text."""
-        return json.dumps(dataclasses.asdict(self), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+    def write(self, out_dir: Path) -> None:
+        """Write the catalogue of a folder, whose outputs are complete."""
+        from pipeline.io.storage import LocalStorage
+
+        text = json.dumps(dataclasses.asdict(self), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+        LocalStorage(root=out_dir).put(NAME, text.encode())
 
     @classmethod
     def from_json(cls, text: str) -> Catalogue:
-        """The inverse of `to_json`."""
+        """The inverse of what `write` writes."""
         found: dict[str, Any] = json.loads(text)
         return cls(
             outputs={name: StoredOutput(**entry) for name, entry in found["outputs"].items()},
@@ -90,13 +103,16 @@ class Catalogue:
         return NoSuchOutputError(f"the request left out {output_id}, or the job had nothing for it; it has: {there}")
 
 
-NOTHING_YET = Catalogue(
-    # any coordinates may be asked for: they are not known to be unknown
-    outputs={},
-    crs=ResultsCrs(name=None, uri=None, to_wgs84="", accuracy_m=None),
-    n_buildings=0,
-)
-"""The catalogue of a job that runs and shows no buildings yet."""
+NOTHING_YET = Catalogue(outputs={}, crs=ResultsCrs(to_wgs84=""))
+"""The catalogue of a job that runs and shows no buildings yet; any coordinates may be asked for."""
+
+
+def stored_outputs(out_dir: Path, kinds: Iterable[OutputKind]) -> dict[str, StoredOutput]:
+    """The entries of some outputs, whose files are complete."""
+    from pipeline.io.storage import sha256_of
+
+    paths = {kind.output_id: out_dir / kind.filename for kind in kinds}
+    return {name: StoredOutput(size_bytes=path.stat().st_size, sha256=sha256_of(path)) for name, path in paths.items()}
 
 
 def run_outputs(out_dir: Path, label: str) -> Path:

@@ -10,13 +10,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from service.outputs.assemble import Progress
-from service.outputs.catalogue import NAME as CATALOGUE_NAME
-from service.outputs.catalogue import Catalogue, ResultsCrs, StoredOutput
+from service.outputs.catalogue import Catalogue, stored_outputs
+from service.outputs.files import zip_files
 from service.outputs.kinds import CLASSIFICATION_OUTPUTS, RASTERS, chosen
-from service.outputs.meshes import zip_files
 
 if TYPE_CHECKING:
-    from pipeline.runtime.classify import ClassifySummary
+    from pipeline.extras.classify.classify import ClassifySummary
 
 
 def write_classification_outputs(
@@ -48,14 +47,12 @@ def write_classification_outputs(
     OSError
         A file is missing, or the folder cannot be written.
     """
-    from pipeline.io.storage import LocalStorage, sha256_of
+    from pipeline.io.storage import LocalStorage
 
     kinds = chosen(wanted, CLASSIFICATION_OUTPUTS)
     folder, storage = Path(summary.out), LocalStorage(root=out_dir)
     names = [Path(file.path).name for file in summary.files]
-    stored = {}
     for kind in kinds:
-        path = out_dir / kind.filename
         if kind.output_id == "points":
             with storage.putting(kind.filename) as temporary, zipfile.ZipFile(temporary, "w") as archive:
                 for done, name in enumerate(names):
@@ -63,13 +60,11 @@ def write_classification_outputs(
                     zip_files(archive, folder, [name])
         elif kind.output_id in RASTERS:
             out_dir.mkdir(parents=True, exist_ok=True)
-            (folder / kind.filename).replace(path)
+            (folder / kind.filename).replace(out_dir / kind.filename)
         else:
             storage.put(kind.filename, _counts(summary, scrub))
-        stored[kind.output_id] = StoredOutput(size_bytes=path.stat().st_size, sha256=sha256_of(path))
     on_progress(len(names), len(names))
-    catalogue = Catalogue(outputs=stored, crs=ResultsCrs.unknown(), n_buildings=0)
-    storage.put(CATALOGUE_NAME, catalogue.to_json().encode())
+    Catalogue(outputs=stored_outputs(out_dir, kinds)).write(out_dir)
     shutil.rmtree(folder, ignore_errors=True)
 
 

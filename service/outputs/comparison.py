@@ -11,11 +11,10 @@ from typing import Any
 from markupsafe import escape
 
 from pipeline.ruler.evaluation.markdown import markdown_cell
-from service.outputs.assemble import Progress, published_tiles, write_outputs
-from service.outputs.catalogue import NAME as CATALOGUE_NAME
-from service.outputs.catalogue import Catalogue, StoredOutput, read_catalogue, run_outputs
+from service.outputs.assemble import Progress, write_outputs
+from service.outputs.catalogue import Catalogue, read_catalogue, run_outputs, stored_outputs
+from service.outputs.files import zip_files, zip_text
 from service.outputs.kinds import COMPARISON_OUTPUTS, chosen
-from service.outputs.meshes import zip_files, zip_text
 from service.outputs.report import cleaner
 
 RUNS = "runs"
@@ -23,6 +22,9 @@ RUNS = "runs"
 
 _TEXTS = frozenset({".json", ".html", ".md"})
 """Endings of files that may contain paths of inputs; tables and models do not."""
+
+_PARTS = 100
+"""Parts of the work for one run, when progress is counted; a file of the archive is one."""
 
 _KEPT_BACK = frozenset({"quarantine", "scratch"})
 """Folders of a run that are not results."""
@@ -55,7 +57,7 @@ def write_comparison_outputs(
     wanted : sequence of str, optional
         Ids of `COMPARISON_OUTPUTS`; all by default.
     on_progress : callable
-        Gets the number of finished tiles and files, and of all. An exception from it ends the work.
+        Gets how much is done, and of how much. An exception from it ends the work.
 
     Raises
     ------
@@ -66,16 +68,18 @@ def write_comparison_outputs(
     OSError
         A file is missing, or the folder cannot be written.
     """
-    from pipeline.io.storage import LocalStorage, sha256_of
+    from pipeline.io.storage import LocalStorage
 
     kinds = chosen(wanted, COMPARISON_OUTPUTS)
     files = sorted(_files(folder))
-    tiles = {label: len(published_tiles(folder / RUNS / label)[0]) for label in labels}
-    done, total = 0, sum(tiles.values()) + len(files)
+    done, total = 0, len(labels) * _PARTS + len(files)
     for label in labels:
-        progress = _after(done, total, on_progress)
+
+        def progress(part: int, of: int, before: int = done) -> None:
+            on_progress(before + _PARTS * part // max(of, 1), total)
+
         write_outputs(folder / RUNS / label, run_outputs(out_dir, label), on_progress=progress)
-        done += tiles[label]
+        done += _PARTS
     clean = _cleaner(folder, labels)
     storage = LocalStorage(root=out_dir)
     for kind in kinds:
@@ -90,23 +94,12 @@ def write_comparison_outputs(
             storage.put(kind.filename, _cleaned(source, clean).encode())
         else:
             storage.put(kind.filename, source.read_bytes())
-    stored = {}
-    for kind in kinds:
-        path = out_dir / kind.filename
-        stored[kind.output_id] = StoredOutput(size_bytes=path.stat().st_size, sha256=sha256_of(path))
     first = read_catalogue(run_outputs(out_dir, labels[0]))
-    catalogue = Catalogue(outputs=stored, crs=first.crs, n_buildings=first.n_buildings, runs=tuple(labels))
-    storage.put(CATALOGUE_NAME, catalogue.to_json().encode())
+    catalogue = Catalogue(
+        outputs=stored_outputs(out_dir, kinds), crs=first.crs, n_buildings=first.n_buildings, runs=tuple(labels)
+    )
+    catalogue.write(out_dir)
     on_progress(total, total)
-
-
-def _after(before: int, total: int, on_progress: Progress) -> Progress:
-    """Turn the progress of a part into that of the whole."""
-
-    def progress(done: int, _of: int) -> None:
-        on_progress(before + done, total)
-
-    return progress
 
 
 def _files(folder: Path) -> Iterator[str]:

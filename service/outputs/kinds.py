@@ -30,297 +30,303 @@ GEOPACKAGE = "application/geopackage+sqlite3"
 """Media type of GeoPackage."""
 PMTILES = "application/vnd.pmtiles"
 """Media type of PMTiles."""
+JSON = "application/json"
+"""Media type of any other JSON document."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
+@dataclasses.dataclass(frozen=True)
 class OutputKind:
     """One output of a process."""
 
     output_id: str
     """Its name in requests, results and paths."""
-    title: str
-    """A short title."""
-    description: str
-    """Content, and how to read it."""
     media_type: str
     """The type that it is served as."""
     filename: str
     """Name of the file in the folder of outputs, and the last part of the name that a browser saves."""
-    schema: Mapping[str, Any]
-    """JSON schema of the value, for the process description."""
+    title: str
+    """A short title."""
+    description: str
+    """Content, and how to read it."""
+    form: str | None = None
+    """The word of the input `publish` that requests it; None if it needs none."""
+    is_selectable: bool = False
+    """Whether it is also made for buildings of some statuses. Outputs that hold no buildings, are about the whole job,
+    or name files of the run are not."""
+
+    @property
+    def is_document(self) -> bool:
+        """Whether it is a JSON object."""
+        return self.media_type in {JSON, GEOJSON}
+
+    @property
+    def schema(self) -> dict[str, Any]:
+        """JSON schema of the value, for the process description."""
+        kind: dict[str, Any] = {"type": "object" if self.is_document else "string", "contentMediaType": self.media_type}
+        if self.media_type == GEOJSON:
+            kind["format"] = "geojson-feature-collection"
+        return (
+            kind if self.is_document or self.media_type in {CITYJSONSEQ, HTML} else kind | {"contentEncoding": "binary"}
+        )
 
 
-def _binary(media_type: str) -> dict[str, Any]:
-    return {"type": "string", "contentEncoding": "binary", "contentMediaType": media_type}
+def _table(*kinds: OutputKind) -> Mapping[str, OutputKind]:
+    return {kind.output_id: kind for kind in kinds}
 
 
-_OF_A_RUN = (
+OUTPUTS = _table(
     OutputKind(
-        output_id="buildings",
-        title="Buildings as GeoParquet",
-        description="One row per candidate, modelled or not: status and reason, roof type, footprint, solids, heights, "
-        "volume, quality and validity. GeoParquet 1.1 in the CRS of the tiles, all tiles in one file.",
-        media_type=GEOPARQUET,
-        filename="buildings.parquet",
-        schema=_binary(GEOPARQUET),
+        "buildings",
+        GEOPARQUET,
+        "buildings.parquet",
+        "Buildings as GeoParquet",
+        "One row per candidate, modelled or not: status and reason, roof type, footprint, solids, heights, volume, "
+        "quality and validity. GeoParquet 1.1 in the CRS of the tiles, all tiles in one file.",
+        is_selectable=True,
     ),
     OutputKind(
-        output_id="planes",
-        title="Roof planes as GeoParquet",
-        description="One row per roof plane: its face in 3D, slope, aspect, coefficients, area and residuals.",
-        media_type=GEOPARQUET,
-        filename="planes.parquet",
-        schema=_binary(GEOPARQUET),
+        "planes",
+        GEOPARQUET,
+        "planes.parquet",
+        "Roof planes as GeoParquet",
+        "One row per roof plane: its face in 3D, slope, aspect, coefficients, area and residuals.",
+        is_selectable=True,
     ),
     OutputKind(
-        output_id="rejected",
-        title="Rejected objects as GeoParquet",
-        description="One row per object that was judged not to be a building, with its reason.",
-        media_type=GEOPARQUET,
-        filename="rejected.parquet",
-        schema=_binary(GEOPARQUET),
+        "rejected",
+        GEOPARQUET,
+        "rejected.parquet",
+        "Rejected objects as GeoParquet",
+        "One row per object that was judged not to be a building, with its reason.",
     ),
     OutputKind(
-        output_id="meshes",
-        title="Meshes as OBJ or GLB in a zip file",
-        description="The solids as Wavefront OBJ in full coordinates, one file per building (or per tile, on "
-        "request); or, on request, as GLB, one file per tile. The names in the zip file are in the column mesh_path. "
-        "With the setting terrain also the terrain of each tile, as OBJ and CityJSONSeq.",
-        media_type=ZIP,
-        filename="meshes.zip",
-        schema=_binary(ZIP),
+        "meshes",
+        ZIP,
+        "meshes.zip",
+        "Meshes as OBJ or GLB in a zip file",
+        "The solids as Wavefront OBJ in full coordinates, one file per building (or per tile, on request); or, on "
+        "request, as GLB, one file per tile. The names in the zip file are in the column mesh_path. With the "
+        "setting terrain also the terrain of each tile, as OBJ and CityJSONSeq.",
+        is_selectable=True,
     ),
     OutputKind(
-        output_id="tileset",
-        title="Points as 3D Tiles",
-        description="The tileset over the points of the run, if the request asked for them: 3D Tiles 1.1 in the CRS of "
-        "the tiles. Each point has its class, its building, its roof plane and its vertical distance to the model.",
-        media_type="application/json",
-        filename="tileset.json",
-        schema={"type": "object", "contentMediaType": "application/json"},
+        "tileset",
+        JSON,
+        "tileset.json",
+        "Points as 3D Tiles",
+        "The tileset over the points of the run, if the request asked for them: 3D Tiles 1.1 in the CRS of the "
+        "tiles. Each point has its class, its building, its roof plane and its vertical distance to the model.",
     ),
     OutputKind(
-        output_id="cityjson",
-        title="Buildings as CityJSONSeq",
-        description="CityJSON 2.0 as text lines: one line of metadata, then one feature per building with the record "
-        "as its attributes, and a BuildingPart with semantic surfaces per solid.",
-        media_type=CITYJSONSEQ,
-        filename="buildings.city.jsonl",
-        schema={"type": "string", "contentMediaType": CITYJSONSEQ},
+        "cityjson",
+        CITYJSONSEQ,
+        "buildings.city.jsonl",
+        "Buildings as CityJSONSeq",
+        "CityJSON 2.0 as text lines: one line of metadata, then one feature per building with the record as its "
+        "attributes, and a BuildingPart with semantic surfaces per solid.",
+        is_selectable=True,
     ),
     OutputKind(
-        output_id="geojson",
-        title="Footprints as GeoJSON",
-        description="RFC 7946: footprints in WGS 84 with all columns as properties; one without an outline has a null "
-        "geometry. If the CRS of the tiles is unknown, the coordinates are in that CRS, and `coordRefSys` is null. "
+        "geojson",
+        GEOJSON,
+        "buildings.geojson",
+        "Footprints as GeoJSON",
+        "RFC 7946: footprints in WGS 84 with all columns as properties; one without an outline has a null geometry."
+        " If the CRS of the tiles is unknown, the coordinates are in that CRS, and `coordRefSys` is null. "
         "`verticalUnitM` has the unit of the columns that are elevations.",
-        media_type=GEOJSON,
-        filename="buildings.geojson",
-        schema={"type": "object", "format": "geojson-feature-collection", "contentMediaType": GEOJSON},
+        is_selectable=True,
     ),
     OutputKind(
-        output_id="report",
-        title="Report of the run",
-        description="Counts by status, reason and roof type, inputs with sha256, settings and hashes, warnings, "
-        "timings, and the digest of the content.",
-        media_type="application/json",
-        filename="report.json",
-        schema={"type": "object", "contentMediaType": "application/json"},
+        "report",
+        JSON,
+        "report.json",
+        "Report of the run",
+        "Counts by status, reason and roof type, inputs with sha256, settings and hashes, warnings, timings, and "
+        "the digest of the content.",
+    ),
+    OutputKind(
+        "3dtiles",
+        JSON,
+        "3dtiles.json",
+        "Models as 3D Tiles",
+        "The tileset for globes such as CesiumJS, if the input publish names 3dtiles: 3D Tiles 1.1 in EPSG:4978, "
+        "with the records. Its files, and a copy of it with paths of its own, are below this output.",
+        form="3dtiles",
+    ),
+    OutputKind(
+        "3dtiles-zip",
+        ZIP,
+        "3dtiles.zip",
+        "Models as 3D Tiles in a zip file",
+        "The same tileset with all its files, to be served elsewhere.",
+        form="3dtiles",
+        is_selectable=True,
+    ),
+    OutputKind(
+        "geopackage",
+        GEOPACKAGE,
+        "models.gpkg",
+        "All tables as GeoPackage",
+        "One file with all layers and their styles, for GIS, if the input publish names geopackage.",
+        form="geopackage",
+        is_selectable=True,
+    ),
+    OutputKind(
+        "pmtiles",
+        PMTILES,
+        "models.pmtiles",
+        "Footprints as PMTiles",
+        "Vector tiles of the footprints in one file, for maps on the web, which read it in ranges; if the input "
+        "publish names pmtiles.",
+        form="pmtiles",
+        is_selectable=True,
+    ),
+    OutputKind(
+        "cityjson-zip",
+        ZIP,
+        "cityjson.zip",
+        "One CityJSON file per tile in a zip file",
+        "CityJSON 2.0 with all levels of detail, for programs that do not read sequences; if the input publish "
+        "names cityjson.",
+        form="cityjson",
+        is_selectable=True,
+    ),
+    OutputKind(
+        "stac",
+        JSON,
+        "stac.json",
+        "Catalogue of the tiles",
+        "A STAC 1.1 Collection, with an Item per tile below this output, if the input publish names stac. Their "
+        "assets are the files of the run.",
+        form="stac",
+    ),
+    OutputKind(
+        "solar",
+        GEOPARQUET,
+        "solar.parquet",
+        "Solar energy per roof plane as GeoParquet",
+        "One row per roof plane: sky view, horizon, and irradiation of a year under clear skies; if the input "
+        "publish names solar.",
+        form="solar",
+    ),
+    OutputKind(
+        "party-walls",
+        GEOPARQUET,
+        "party_walls.parquet",
+        "Party walls as GeoParquet",
+        "One row per pair of walls of two buildings that touch: the shared polygon and its area; if the input "
+        "publish names party-walls.",
+        form="party-walls",
+    ),
+    OutputKind(
+        "wall-areas",
+        GEOPARQUET,
+        "wall_areas.parquet",
+        "Wall areas per building as GeoParquet",
+        "One row per building: how much of its walls is shared, inner and exposed; with the party walls.",
+        form="party-walls",
     ),
 )
-
-_PUBLISHED = (
-    OutputKind(
-        output_id="3dtiles",
-        title="Models as 3D Tiles",
-        description="The tileset for globes such as CesiumJS, if the input publish names 3dtiles: 3D Tiles 1.1 in "
-        "EPSG:4978, with the records. Its files, and a copy of it with paths of its own, are below this output.",
-        media_type="application/json",
-        filename="3dtiles.json",
-        schema={"type": "object", "contentMediaType": "application/json"},
-    ),
-    OutputKind(
-        output_id="3dtiles-zip",
-        title="Models as 3D Tiles in a zip file",
-        description="The same tileset with all its files, to be served elsewhere.",
-        media_type=ZIP,
-        filename="3dtiles.zip",
-        schema=_binary(ZIP),
-    ),
-    OutputKind(
-        output_id="geopackage",
-        title="All tables as GeoPackage",
-        description="One file with all layers and their styles, for GIS, if the input publish names geopackage.",
-        media_type=GEOPACKAGE,
-        filename="models.gpkg",
-        schema=_binary(GEOPACKAGE),
-    ),
-    OutputKind(
-        output_id="pmtiles",
-        title="Footprints as PMTiles",
-        description="Vector tiles of the footprints in one file, for maps on the web, which read it in ranges; if the "
-        "input publish names pmtiles.",
-        media_type=PMTILES,
-        filename="models.pmtiles",
-        schema=_binary(PMTILES),
-    ),
-    OutputKind(
-        output_id="cityjson-zip",
-        title="One CityJSON file per tile in a zip file",
-        description="CityJSON 2.0 with all levels of detail, for programs that do not read sequences; if the input "
-        "publish names cityjson.",
-        media_type=ZIP,
-        filename="cityjson.zip",
-        schema=_binary(ZIP),
-    ),
-    OutputKind(
-        output_id="stac",
-        title="Catalogue of the tiles",
-        description="A STAC 1.1 Collection, with an Item per tile below this output, if the input publish names stac. "
-        "Their assets are the files of the run.",
-        media_type="application/json",
-        filename="stac.json",
-        schema={"type": "object", "contentMediaType": "application/json"},
-    ),
-    OutputKind(
-        output_id="solar",
-        title="Solar energy per roof plane as GeoParquet",
-        description="One row per roof plane: sky view, horizon, and irradiation of a year under clear skies; if the "
-        "input publish names solar.",
-        media_type=GEOPARQUET,
-        filename="solar.parquet",
-        schema=_binary(GEOPARQUET),
-    ),
-    OutputKind(
-        output_id="party-walls",
-        title="Party walls as GeoParquet",
-        description="One row per pair of walls of two buildings that touch: the shared polygon and its area; if the "
-        "input publish names party-walls.",
-        media_type=GEOPARQUET,
-        filename="party_walls.parquet",
-        schema=_binary(GEOPARQUET),
-    ),
-    OutputKind(
-        output_id="wall-areas",
-        title="Wall areas per building as GeoParquet",
-        description="One row per building: how much of its walls is shared, inner and exposed; with the party walls.",
-        media_type=GEOPARQUET,
-        filename="wall_areas.parquet",
-        schema=_binary(GEOPARQUET),
-    ),
-)
-
-_OF_A_COMPARISON = (
-    OutputKind(
-        output_id="page",
-        title="Comparison as a page",
-        description="One page for a browser: the methods side by side, with pictures and a table per building. It "
-        "holds all that it shows, and its content cannot reach the service.",
-        media_type=HTML,
-        filename="index.html",
-        schema={"type": "string", "contentMediaType": HTML},
-    ),
-    OutputKind(
-        output_id="table",
-        title="Comparison as GeoParquet",
-        description="One row per building and method: status and reason, roof type, planes, residuals, seconds, "
-        "footprint.",
-        media_type=GEOPARQUET,
-        filename="buildings.parquet",
-        schema=_binary(GEOPARQUET),
-    ),
-    OutputKind(
-        output_id="summary",
-        title="Summary of the comparison",
-        description="Methods with their presets, hashes of settings, digests, inputs, counts and seconds.",
-        media_type="application/json",
-        filename="compare.json",
-        schema={"type": "object", "contentMediaType": "application/json"},
-    ),
-    OutputKind(
-        output_id="archive",
-        title="The whole comparison in a zip file",
-        description="Page, table, summary, and a run directory per method with all its tables and models.",
-        media_type=ZIP,
-        filename="comparison.zip",
-        schema=_binary(ZIP),
-    ),
-)
-
-_OF_A_CLASSIFICATION = (
-    OutputKind(
-        output_id="points",
-        title="Classified points as LAZ in a zip file",
-        description="One LAZ 1.4 file per tile, in the order of its points and with all their attributes; only the "
-        "classes are new: 1 other, 2 ground, 5 vegetation, 6 building, 7 noise, 17 bridge.",
-        media_type=ZIP,
-        filename="points.zip",
-        schema=_binary(ZIP),
-    ),
-    *(
-        OutputKind(
-            output_id=name,
-            title=f"{title} as cloud-optimised GeoTIFF",
-            description=f"{content} One raster for all tiles; empty cells have no value.",
-            media_type=GEOTIFF,
-            filename=f"{name}.tif",
-            schema=_binary(GEOTIFF),
-        )
-        for name, title, content in (
-            ("terrain", "Terrain", "Elevation of the ground, also below buildings."),
-            ("surface", "Surface", "Elevation of the highest point of each cell."),
-            ("height", "Height", "Height of the surface above the terrain."),
-        )
-    ),
-    OutputKind(
-        output_id="classes",
-        title="Counts by class",
-        description="Points by class, files with their points, number of buildings, warnings and timings.",
-        media_type="application/json",
-        filename="classes.json",
-        schema={"type": "object", "contentMediaType": "application/json"},
-    ),
-)
-
-OUTPUTS: Mapping[str, OutputKind] = {kind.output_id: kind for kind in (*_OF_A_RUN, *_PUBLISHED)}
 """The outputs of a run by their ids, in the order of lists: those of the process `reconstruct`."""
 
-FORMATS: Mapping[str, tuple[str, ...]] = {
-    "3dtiles": ("3dtiles", "3dtiles-zip"),
-    "geopackage": ("geopackage",),
-    "pmtiles": ("pmtiles",),
-    "cityjson": ("cityjson-zip",),
-    "stac": ("stac",),
-    "solar": ("solar",),
-    "party-walls": ("party-walls", "wall-areas"),
-}
-"""The ids of those that are made on request, by the words of the input `publish`."""
-ON_REQUEST = frozenset(name for ids in FORMATS.values() for name in ids)
-"""All of these."""
-
-COMPARISON_OUTPUTS: Mapping[str, OutputKind] = {kind.output_id: kind for kind in _OF_A_COMPARISON}
+COMPARISON_OUTPUTS = _table(
+    OutputKind(
+        "page",
+        HTML,
+        "index.html",
+        "Comparison as a page",
+        "One page for a browser: the methods side by side, with pictures and a table per building. It holds all "
+        "that it shows, and its content cannot reach the service.",
+    ),
+    OutputKind(
+        "table",
+        GEOPARQUET,
+        "buildings.parquet",
+        "Comparison as GeoParquet",
+        "One row per building and method: status and reason, roof type, planes, residuals, seconds, footprint.",
+    ),
+    OutputKind(
+        "summary",
+        JSON,
+        "compare.json",
+        "Summary of the comparison",
+        "Methods with their presets, hashes of settings, digests, inputs, counts and seconds.",
+    ),
+    OutputKind(
+        "archive",
+        ZIP,
+        "comparison.zip",
+        "The whole comparison in a zip file",
+        "Page, table, summary, and a run directory per method with all its tables and models.",
+    ),
+)
 """The outputs of the process `compare`."""
 
-CLASSIFICATION_OUTPUTS: Mapping[str, OutputKind] = {kind.output_id: kind for kind in _OF_A_CLASSIFICATION}
+CLASSIFICATION_OUTPUTS = _table(
+    OutputKind(
+        "points",
+        ZIP,
+        "points.zip",
+        "Classified points as LAZ in a zip file",
+        "One LAZ 1.4 file per tile, in the order of its points and with all their attributes; only the classes are "
+        "new: 1 other, 2 ground, 5 vegetation, 6 building, 7 noise, 17 bridge.",
+    ),
+    OutputKind(
+        "terrain",
+        GEOTIFF,
+        "terrain.tif",
+        "Terrain as cloud-optimised GeoTIFF",
+        "Elevation of the ground, also below buildings. One raster for all tiles; empty cells have no value.",
+    ),
+    OutputKind(
+        "surface",
+        GEOTIFF,
+        "surface.tif",
+        "Surface as cloud-optimised GeoTIFF",
+        "Elevation of the highest point of each cell. One raster for all tiles; empty cells have no value.",
+    ),
+    OutputKind(
+        "height",
+        GEOTIFF,
+        "height.tif",
+        "Height as cloud-optimised GeoTIFF",
+        "Height of the surface above the terrain. One raster for all tiles; empty cells have no value.",
+    ),
+    OutputKind(
+        "classes",
+        JSON,
+        "classes.json",
+        "Counts by class",
+        "Points by class, files with their points, number of buildings, warnings and timings.",
+    ),
+)
 """The outputs of the process `classify`."""
 
-ECHO_OUTPUTS: Mapping[str, OutputKind] = {
-    "echo": OutputKind(
-        output_id="echo",
-        title="The message",
-        description="The message that came with the request.",
-        media_type="application/json",
-        filename="echo.json",
-        schema={"type": "object", "contentMediaType": "application/json"},
-    )
-}
+ECHO_OUTPUTS = _table(
+    OutputKind(
+        "echo",
+        JSON,
+        "echo.json",
+        "The message",
+        "The message that came with the request.",
+    ),
+)
 """The output of the process `echo`."""
-
-RASTERS = ("terrain", "surface", "height")
-"""Those of them that are rasters."""
 
 KINDS: Mapping[str, OutputKind] = {**OUTPUTS, **COMPARISON_OUTPUTS, **CLASSIFICATION_OUTPUTS, **ECHO_OUTPUTS}
 """All outputs; an id means the same in all processes."""
+ON_REQUEST = frozenset(name for name, kind in KINDS.items() if kind.form is not None)
+"""Those that are made on request."""
+FORMATS: Mapping[str, tuple[str, ...]] = {
+    form: tuple(name for name in KINDS if KINDS[name].form == form)
+    for form in dict.fromkeys(kind.form for kind in KINDS.values())
+    if form is not None
+}
+"""Their ids by the words of the input `publish`."""
+SELECTABLE = tuple(name for name, kind in KINDS.items() if kind.is_selectable)
+"""Those that are also made for buildings of some statuses."""
+RASTERS = tuple(name for name, kind in KINDS.items() if kind.media_type == GEOTIFF)
+"""Those that are rasters."""
 
 
 def chosen(wanted: Iterable[str] | None, kinds: Mapping[str, OutputKind] = OUTPUTS) -> tuple[OutputKind, ...]:

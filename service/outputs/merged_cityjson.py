@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from pipeline.errors import RunError
 from pipeline.export.cityjson import VERSION
@@ -21,26 +20,40 @@ _EMPTY: dict[str, Any] = {
 }
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class FeaturePlace:
-    """Position of a building's feature in its tile's file."""
+def merge_cityjson(path: Path, sources: Sequence[Path], each: Iterable[Path]) -> None:
+    """Write one CityJSONSeq file from the tiles' files.
 
-    building_id: str
-    """The building."""
-    start: int
-    """First byte of its line."""
-    size: int
-    """Bytes of its line, without the line's end."""
+    Each tile counts its integer vertices from a corner of its own; here all are counted from the lowest of these
+    corners. The corners are whole units and the scales powers of ten, so no vertex moves.
 
-
-def read_header(path: Path) -> dict[str, Any]:
-    """The first line of a CityJSONSeq file.
+    Parameters
+    ----------
+    path : Path
+        The file to write.
+    sources : sequence of Path
+        The tiles' files; may be empty.
+    each : iterable of Path
+        The same, as they are written.
 
     Raises
     ------
     RunError
-        The file is missing or damaged.
+        A file is missing or damaged, or the files are of several runs.
     """
+    first = _united([_header(source) for source in sources])
+    with path.open("wb") as stream:
+        stream.write(_line(first))
+        for source in each:
+            with source.open("rb") as lines:
+                own = json.loads(next(lines))["transform"]["translate"]
+                there, scale = first["transform"]["translate"], first["transform"]["scale"]
+                shift = [round((own[axis] - there[axis]) / scale[axis]) for axis in range(3)]
+                for line in lines:
+                    stream.write(_moved(line, shift) if any(shift) else line)
+
+
+def _header(path: Path) -> dict[str, Any]:
+    """The first line of a CityJSONSeq file."""
     try:
         with path.open("rb") as stream:
             header: dict[str, Any] = json.loads(stream.readline())
@@ -49,72 +62,32 @@ def read_header(path: Path) -> dict[str, Any]:
     return header
 
 
-def features(path: Path) -> Iterator[tuple[FeaturePlace, bytes]]:
-    """The features of a tile's file: where each lies, and its line without the line's end."""
-    with path.open("rb") as stream:
-        start = len(stream.readline())
-        for line in stream:
-            text = line.rstrip(b"\n")
-            if text:
-                name = json.loads(text)["id"]
-                yield FeaturePlace(building_id=name, start=start, size=len(text)), text
-            start += len(line)
+def _united(headers: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """The first line for the features of all tiles."""
+    placed = [header for header in headers if "geographicalExtent" in header["metadata"]]
+    first = (placed or list(headers) or [_EMPTY])[0]
+    scale = first["transform"]["scale"]
+    if any(header["transform"]["scale"] != scale for header in placed):
+        raise RunError("the tiles' CityJSON files have more than one scale: files of two runs lie in one directory")
+    corners = [header["transform"]["translate"] for header in placed] or [[0.0, 0.0, 0.0]]
+    metadata = {**first["metadata"], "title": "buildings"}
+    metadata.pop("geographicalExtent", None)
+    if placed:
+        extents = [header["metadata"]["geographicalExtent"] for header in placed]
+        low = [min(extent[axis] for extent in extents) for axis in range(3)]
+        high = [max(extent[axis] for extent in extents) for axis in range(3, 6)]
+        metadata["geographicalExtent"] = [*low, *high]
+    translate = [min(corner[axis] for corner in corners) for axis in range(3)]
+    return {**first, "transform": {"scale": scale, "translate": translate}, "metadata": metadata}
 
 
-class MergedCityJson:
-    """Writes one CityJSONSeq file from the tiles' files.
-
-    Each tile counts its integer vertices from a corner of its own; here all are counted from the lowest of these
-    corners. The corners are whole units and the scales powers of ten, so no vertex moves.
-
-    Parameters
-    ----------
-    stream : binary file
-        To be written.
-    headers : sequence of dict
-        The tiles' first lines; may be empty.
-    """
-
-    def __init__(self, stream: BinaryIO, headers: Sequence[dict[str, Any]]) -> None:
-        self._stream = stream
-        placed = [header for header in headers if "geographicalExtent" in header["metadata"]]
-        first = (placed or list(headers) or [_EMPTY])[0]
-        self._scale = first["transform"]["scale"]
-        if any(header["transform"]["scale"] != self._scale for header in placed):
-            raise RunError("the tiles' CityJSON files have more than one scale: files of two runs lie in one directory")
-        corners = [header["transform"]["translate"] for header in placed] or [[0.0, 0.0, 0.0]]
-        self._translate = [min(corner[axis] for corner in corners) for axis in range(3)]
-        metadata = {**first["metadata"], "title": "buildings"}
-        metadata.pop("geographicalExtent", None)
-        if placed:
-            extents = [header["metadata"]["geographicalExtent"] for header in placed]
-            low = [min(extent[axis] for extent in extents) for axis in range(3)]
-            high = [max(extent[axis] for extent in extents) for axis in range(3, 6)]
-            metadata["geographicalExtent"] = [*low, *high]
-        header = {
-            **first,
-            "transform": {"scale": self._scale, "translate": self._translate},
-            "metadata": metadata,
-        }
-        self._put(_json(header))
-
-    def add(self, header: dict[str, Any], line: bytes) -> None:
-        """Append one feature of the tile with this first line."""
-        corner = header["transform"]["translate"]
-        shift = [round((corner[axis] - self._translate[axis]) / self._scale[axis]) for axis in range(3)]
-        if not any(shift):
-            self._put(line)
-            return
-        feature = json.loads(line)
-        dx, dy, dz = shift
-        feature["vertices"] = [[x + dx, y + dy, z + dz] for x, y, z in feature["vertices"]]
-        self._put(_json(feature))
-
-    def _put(self, line: bytes) -> None:
-        self._stream.write(line)
-        self._stream.write(b"\n")
+def _moved(line: bytes, shift: Sequence[int]) -> bytes:
+    """A feature with its vertices counted from another corner."""
+    feature = json.loads(line)
+    dx, dy, dz = shift
+    return _line({**feature, "vertices": [[x + dx, y + dy, z + dz] for x, y, z in feature["vertices"]]})
 
 
-def _json(value: dict[str, Any]) -> bytes:
+def _line(value: dict[str, Any]) -> bytes:
     """One line of JSON without spaces."""
-    return json.dumps(value, separators=(",", ":"), ensure_ascii=False, allow_nan=False).encode()
+    return json.dumps(value, separators=(",", ":"), ensure_ascii=False, allow_nan=False).encode() + b"\n"

@@ -5,8 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -19,8 +18,8 @@ ROWS_PER_GROUP = 5_000
 """Rows in one row group: a reader with a window skips the groups whose `bbox` is elsewhere."""
 
 
-class MergedTable:
-    """Writes one GeoParquet file from the tiles' files; `tile` becomes an ordinary column.
+def merge_tables(path: Path, table_name: str, tiles: Iterable[tuple[str, Path]], geo: Mapping[str, Any]) -> None:
+    """Write one GeoParquet file from the tiles' files; `tile` becomes an ordinary column.
 
     Parameters
     ----------
@@ -28,63 +27,35 @@ class MergedTable:
         The file to write.
     table_name : str
         buildings, planes or rejected.
-    sources : sequence of Path
-        The tiles' files, whose `geo` metadata are united.
-    projjson : mapping or None
-        The CRS of a table without tiles; None if it is unknown.
-    """
-
-    def __init__(
-        self, path: Path, table_name: str, sources: Sequence[Path], projjson: Mapping[str, Any] | None
-    ) -> None:
-        no_geometry = np.empty(0, dtype=object)
-        nothing = geo_metadata(no_geometry, projjson, dict.fromkeys(shape_names(table_name), no_geometry))
-        geo = united_metadata(_metadata(source) for source in sources) if sources else nothing
-        plain = stored_schema(table_name).append(pa.field("tile", pa.string(), nullable=False))
-        self._schema = plain.with_metadata({"geo": json.dumps(geo, sort_keys=True, separators=(",", ":"))})
-        self._writer = pq.ParquetWriter(path, self._schema, compression="zstd", write_statistics=True)
-        self._waiting: list[pa.Table] = []
-        self._rows = 0
-
-    def add(self, tile: str, table: pa.Table) -> None:
-        """Append the rows of one tile."""
-        named = table.append_column(self._schema.field("tile"), pa.array([tile] * table.num_rows, pa.string()))
-        self._waiting.append(named.select(self._schema.names).cast(self._schema))
-        self._rows += table.num_rows
-        if self._rows >= ROWS_PER_GROUP:
-            self._write(whole_groups=True)
-
-    def _write(self, *, whole_groups: bool) -> None:
-        """Write the waiting rows, in whole row groups or all of them."""
-        united = pa.concat_tables(self._waiting) if self._waiting else self._schema.empty_table()
-        count = united.num_rows // ROWS_PER_GROUP * ROWS_PER_GROUP if whole_groups else united.num_rows
-        if count:
-            self._writer.write_table(united.slice(0, count).combine_chunks(), row_group_size=ROWS_PER_GROUP)
-        # a copy: a slice would keep the whole table in memory
-        rest = united.slice(count).combine_chunks()
-        self._waiting, self._rows = ([rest] if rest.num_rows else []), rest.num_rows
-
-    def __enter__(self) -> Self:
-        """Open for writing."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Write the last rows and the footer."""
-        if kind is None:
-            self._write(whole_groups=False)
-        self._writer.close()
-
-
-def read_tile(path: Path) -> pa.Table:
-    """The rows of one tile's file.
+    tiles : iterable of tuple
+        Key and file of each tile.
+    geo : mapping
+        The `geo` metadata, of `united_metadata`.
 
     Raises
     ------
     RunError
-        The file is missing or damaged.
+        A file is missing or damaged.
     """
+    plain = stored_schema(table_name).append(pa.field("tile", pa.string(), nullable=False))
+    schema = plain.with_metadata({"geo": json.dumps(geo, sort_keys=True, separators=(",", ":"))})
+    waiting = schema.empty_table()
+    with pq.ParquetWriter(path, schema, compression="zstd", write_statistics=True) as writer:
+        for tile, source in tiles:
+            table = _read(source)
+            named = table.append_column(schema.field("tile"), pa.array([tile] * table.num_rows, pa.string()))
+            waiting = pa.concat_tables([waiting, named.select(schema.names).cast(schema)])
+            whole = waiting.num_rows // ROWS_PER_GROUP * ROWS_PER_GROUP
+            if whole:
+                writer.write_table(waiting.slice(0, whole), row_group_size=ROWS_PER_GROUP)
+                # a copy: a slice would keep the whole table in memory
+                waiting = waiting.slice(whole).combine_chunks()
+        if waiting.num_rows:
+            writer.write_table(waiting, row_group_size=ROWS_PER_GROUP)
+
+
+def _read(path: Path) -> pa.Table:
+    """The rows of one tile's file."""
     try:
         with pq.ParquetFile(path) as file:
             return file.read()
@@ -92,31 +63,32 @@ def read_tile(path: Path) -> pa.Table:
         raise RunError(f"{path} cannot be read as Parquet: {error}") from error
 
 
-def _metadata(path: Path) -> dict[str, Any]:
-    """The `geo` metadata of one file."""
-    try:
-        geo: dict[str, Any] = json.loads(pq.read_metadata(path).metadata[b"geo"])
-    except (pa.ArrowInvalid, OSError, KeyError, TypeError) as error:
-        raise RunError(f"{path} cannot be read as GeoParquet: {error}") from error
-    return geo
-
-
-def united_metadata(parts: Iterable[dict[str, Any]]) -> dict[str, Any]:
+def united_metadata(table_name: str, sources: Iterable[Path], projjson: Mapping[str, Any] | None) -> dict[str, Any]:
     """The `geo` metadata of several files as one: all geometry types, and the bounds of all.
 
     Parameters
     ----------
-    parts : iterable of dict
-        Made by `pipeline.export.geoparquet.geo_metadata`, of one CRS; at least one.
+    table_name : str
+        buildings, planes or rejected.
+    sources : iterable of Path
+        The tiles' files.
+    projjson : mapping or None
+        The CRS of a table without tiles; None if it is unknown.
 
     Raises
     ------
     RunError
-        There is none, or the files are of several CRS.
+        A file is missing or damaged, or the files are of several CRS.
     """
-    found = list(parts)
+    found = []
+    for path in sources:
+        try:
+            found.append(json.loads(pq.read_metadata(path).metadata[b"geo"]))
+        except (pa.ArrowInvalid, OSError, KeyError, TypeError) as error:
+            raise RunError(f"{path} cannot be read as GeoParquet: {error}") from error
     if not found:
-        raise RunError("a merged table needs at least one tile")
+        no_geometry = np.empty(0, dtype=object)
+        return geo_metadata(no_geometry, projjson, dict.fromkeys(shape_names(table_name), no_geometry))
     if any(part["columns"]["geometry"]["crs"] != found[0]["columns"]["geometry"]["crs"] for part in found):
         raise RunError("the tiles have more than one CRS: files of two runs lie in one directory")
     names = dict.fromkeys(name for part in found for name in part["columns"])

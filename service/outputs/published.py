@@ -15,14 +15,15 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from service.outputs.kinds import FORMATS, GEOJSON, GLB, OUTPUTS
+from service.outputs.files import write_json, write_moved_tileset, zip_files
+from service.outputs.kinds import FORMATS, OUTPUTS
 
 if TYPE_CHECKING:
     from pipeline.runtime.monitoring.progress import Listener
 
 _TILE = r"x-?\d{1,9}_y-?\d{1,9}"
 _SQUARE = rf"{_TILE}_\d{{1,9}}"
-_FILES: Mapping[str, re.Pattern[str]] = MappingProxyType(
+FILES: Mapping[str, re.Pattern[str]] = MappingProxyType(
     {
         "3dtiles": re.compile(
             rf"(tileset|terrain)\.json|(models|blocks|terrain)/{_TILE}\.glb|skylines/{_SQUARE}\.glb", re.ASCII
@@ -41,28 +42,6 @@ RUN_FILE = re.compile(
     re.ASCII,
 )
 """Matches the files of a run that a catalogue lists."""
-_TYPES = {".json": "application/json", ".glb": GLB}
-
-
-def is_file_of(output_id: str, name: str) -> bool:
-    """Whether a file below an output may have this name.
-
-    >>> is_file_of("3dtiles", "models/x85_y447.glb"), is_file_of("3dtiles", "../run.json")
-    (True, False)
-    >>> is_file_of("stac", "x85_y447/x85_y447.json"), is_file_of("report", "tileset.json")
-    (True, False)
-    """
-    return output_id in _FILES and _FILES[output_id].fullmatch(name) is not None
-
-
-def type_of(output_id: str, name: str) -> str:
-    """The media type of a file below an output; an Item is GeoJSON.
-
-    >>> type_of("stac", "points/collection.json"), type_of("stac", "x85_y447/x85_y447.json")
-    ('application/json', 'application/geo+json')
-    """
-    is_item = output_id == "stac" and Path(name).name != ROOTS["stac"]
-    return GEOJSON if is_item else _TYPES[Path(name).suffix]
 
 
 def _nothing(done: int, total: int) -> None:
@@ -132,34 +111,28 @@ _Options = Mapping[str, Any]
 
 
 def _tiles(run_dir: Path, out_dir: Path, options: _Options, on_event: Listener) -> None:
-    from pipeline.runtime.publishing_3dtiles import publish_3dtiles
+    from pipeline.extras.publish_3dtiles.publishing_3dtiles import publish_3dtiles
 
     place = out_dir / "3dtiles"
     publish_3dtiles(str(run_dir), str(place), geoid_height_m=options["geoid_height_m"], on_event=on_event)
     _zip(place, out_dir / OUTPUTS["3dtiles-zip"].filename)
-    tileset = json.loads((place / ROOTS["3dtiles"]).read_bytes())
-    waiting = [tileset["root"]]
-    for node in waiting:
-        if "content" in node:
-            node["content"]["uri"] = f"3dtiles/{node['content']['uri']}"
-        waiting.extend(node.get("children", ()))
-    _put(out_dir / OUTPUTS["3dtiles"].filename, tileset)
+    write_moved_tileset(place / ROOTS["3dtiles"], out_dir / OUTPUTS["3dtiles"].filename, "3dtiles")
 
 
 def _geopackage(run_dir: Path, out_dir: Path, _: _Options, on_event: Listener) -> None:
-    from pipeline.runtime.publishing import publish_geopackage
+    from pipeline.extras.publish.publishing import publish_geopackage
 
     publish_geopackage(str(run_dir), str(out_dir / OUTPUTS["geopackage"].filename), on_event=on_event)
 
 
 def _pmtiles(run_dir: Path, out_dir: Path, _: _Options, on_event: Listener) -> None:
-    from pipeline.runtime.publishing import publish_pmtiles
+    from pipeline.extras.publish.publishing import publish_pmtiles
 
     publish_pmtiles(str(run_dir), str(out_dir / OUTPUTS["pmtiles"].filename), on_event=on_event)
 
 
 def _cityjson(run_dir: Path, out_dir: Path, _: _Options, on_event: Listener) -> None:
-    from pipeline.runtime.publishing import publish_cityjson
+    from pipeline.extras.publish.publishing import publish_cityjson
 
     place = out_dir / "cityjson"
     publish_cityjson(str(run_dir), str(place), on_event=on_event)
@@ -168,7 +141,7 @@ def _cityjson(run_dir: Path, out_dir: Path, _: _Options, on_event: Listener) -> 
 
 
 def _stac(run_dir: Path, out_dir: Path, options: _Options, on_event: Listener) -> None:
-    from pipeline.runtime.publishing import publish_stac
+    from pipeline.extras.publish.publishing import publish_stac
 
     place = out_dir / "stac"
     # what is about the run as a whole names folders of the server
@@ -177,13 +150,13 @@ def _stac(run_dir: Path, out_dir: Path, options: _Options, on_event: Listener) -
     for link in collection["links"]:
         if link["href"].startswith("./"):
             link["href"] = f"stac/{link['href'].removeprefix('./')}"
-    _put(out_dir / OUTPUTS["stac"].filename, collection)
+    write_json(out_dir / OUTPUTS["stac"].filename, collection)
 
 
 def _solar(run_dir: Path, out_dir: Path, _: _Options, on_event: Listener) -> None:
     from pipeline.errors import RunError
+    from pipeline.extras.solar.solar_of_run import solar
     from pipeline.runtime.manifest_reading import read_manifest
-    from pipeline.runtime.solar import solar
 
     if not (read_manifest(str(run_dir)).crs or {}).get("wkt"):
         raise RunError("the CRS of the tiles is unknown, so the sun's place is, too: submit again with --crs EPSG:n")
@@ -191,7 +164,7 @@ def _solar(run_dir: Path, out_dir: Path, _: _Options, on_event: Listener) -> Non
 
 
 def _party_walls(run_dir: Path, out_dir: Path, _: _Options, on_event: Listener) -> None:
-    from pipeline.runtime.party_walls import party_walls
+    from pipeline.extras.party_walls.party_walls_of_run import party_walls
 
     walls, areas = (str(out_dir / OUTPUTS[name].filename) for name in FORMATS["party-walls"])
     party_walls(str(run_dir), walls, buildings=areas, on_event=on_event)
@@ -210,14 +183,8 @@ _WRITERS: Mapping[str, Callable[[Path, Path, _Options, Listener], None]] = Mappi
 )
 
 
-def _put(path: Path, document: Mapping[str, Any]) -> None:
-    path.write_text(json.dumps(document, separators=(",", ":"), ensure_ascii=False), encoding="utf-8")
-
-
 def _zip(folder: Path, target: Path) -> None:
     """All files of a folder in a zip file, by name."""
-    from service.outputs.meshes import zip_files
-
     names = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
     with zipfile.ZipFile(target, "w") as archive:
         zip_files(archive, folder, names)

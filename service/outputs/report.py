@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
-import json
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from pipeline.model import Status
 from pipeline.runtime.manifest_reading import city_unit_m
+from service.features.index import RowIndex
 from service.outputs.catalogue import ResultsCrs
 from service.wording import as_inputs
 
@@ -18,48 +16,8 @@ FORMAT = 1
 """Version of the report's layout."""
 
 
-@dataclasses.dataclass(kw_only=True)
-class Tally:
-    """Counts made while the tables are merged."""
-
-    buildings: int = 0
-    statuses: Counter[str] = dataclasses.field(default_factory=Counter)
-    roof_types: Counter[str] = dataclasses.field(default_factory=Counter)
-    reasons: Counter[str] = dataclasses.field(default_factory=Counter)
-    methods: Counter[str] = dataclasses.field(default_factory=Counter)
-    lods: Counter[str] = dataclasses.field(default_factory=Counter)
-    planes: int = 0
-    rejected: int = 0
-    rejected_reasons: Counter[str] = dataclasses.field(default_factory=Counter)
-    modelled: int = 0
-    """Buildings with a model."""
-    without_geometry: int = 0
-    """Buildings without an outline in the GeoJSON."""
-    cut: int = 0
-    """Buildings at the edge of the data."""
-
-    def count_building(self, record: Mapping[str, Any], *, has_geometry: bool) -> None:
-        """Count one row of the buildings table."""
-        self.buildings += 1
-        self.statuses[record["status"]] += 1
-        self.roof_types[record["roof_type"]] += 1
-        self.methods[record["method"]] += 1
-        if record["reason"] is not None:
-            self.reasons[record["reason"]] += 1
-        if record["lod"] is not None:
-            self.lods[record["lod"]] += 1
-            self.modelled += 1
-        self.without_geometry += not has_geometry
-        self.cut += bool(record["touches_data_edge"])
-
-    def count_rejected(self, reasons: Sequence[str]) -> None:
-        """Count rows of the rejected table."""
-        self.rejected += len(reasons)
-        self.rejected_reasons.update(reasons)
-
-
 def report(
-    manifest: Mapping[str, Any], tally: Tally, crs: ResultsCrs, failed_tiles: Mapping[str, str], run_dir: Path
+    manifest: Mapping[str, Any], index: RowIndex, crs: ResultsCrs, failed_tiles: Mapping[str, str], run_dir: Path
 ) -> dict[str, Any]:
     """The report as plain JSON values, without paths of the server.
 
@@ -67,8 +25,8 @@ def report(
     ----------
     manifest : mapping
         The content of `run.json`.
-    tally : Tally
-        Counts of the merged tables.
+    index : RowIndex
+        The rows of the tables, which are counted.
     crs : ResultsCrs
         The CRS of the results.
     failed_tiles : mapping of str
@@ -79,6 +37,8 @@ def report(
     clean = cleaner([entry["path"] for entry in manifest["inputs"]], run_dir)
     inputs = [{"name": Path(entry["path"]).name, **_without(entry, "path")} for entry in manifest["inputs"]]
     facts = manifest.get("crs") or {}
+    shown = "degrees" if crs.is_known else "geometry"
+    statuses = _counts(index, "buildings", "status")
     return {
         "format": FORMAT,
         "status": manifest["status"],
@@ -96,17 +56,17 @@ def report(
             "to_wgs84_accuracy_m": crs.accuracy_m,
         },
         "buildings": {
-            "candidates": tally.buildings,
-            "by_status": {status.value: tally.statuses[status.value] for status in Status},
-            "by_reason": _sorted(tally.reasons),
-            "by_roof_type": _sorted(tally.roof_types),
-            "by_lod": _sorted(tally.lods),
-            "by_method": _sorted(tally.methods),
-            "roof_planes": tally.planes,
-            "without_footprint": tally.without_geometry,
-            "at_the_edge_of_the_data": tally.cut,
+            "candidates": index.totals("buildings").n,
+            "by_status": {status.value: statuses.get(status.value, 0) for status in Status},
+            "by_reason": _counts(index, "buildings", "reason"),
+            "by_roof_type": _counts(index, "buildings", "roof_type"),
+            "by_lod": _counts(index, "buildings", "lod"),
+            "by_method": _counts(index, "buildings", "method"),
+            "roof_planes": index.totals("planes").n,
+            "without_footprint": index.figure(f"SELECT count(*) FROM buildings WHERE {shown} IS NULL"),  # noqa: S608
+            "at_the_edge_of_the_data": _counts(index, "buildings", "touches_data_edge").get(1, 0),
         },
-        "rejected": {"objects": tally.rejected, "by_reason": _sorted(tally.rejected_reasons)},
+        "rejected": {"objects": index.totals("rejected").n, "by_reason": _counts(index, "rejected", "reason")},
         "tiles": {
             "planned": len(manifest["tiles"]) + len(set(failed_tiles) - set(manifest["tiles"])),
             "failed": [{"tile": tile, "reason": clean(why)} for tile, why in sorted(failed_tiles.items())],
@@ -124,14 +84,11 @@ def report(
     }
 
 
-def report_bytes(found: Mapping[str, Any]) -> bytes:
-    """A report as a file."""
-    return (json.dumps(found, indent=2, ensure_ascii=False, allow_nan=False) + "\n").encode()
-
-
-def _sorted(counts: Counter[str]) -> dict[str, int]:
-    """The counts, largest first."""
-    return dict(sorted(counts.items(), key=lambda entry: (-entry[1], entry[0])))
+def _counts(index: RowIndex, table: str, column: str) -> dict[Any, int]:
+    """How many rows have each value, the most frequent first; null is not counted."""
+    with index.opened() as connection:
+        query = f"SELECT {column}, count(*) FROM {table} WHERE {column} IS NOT NULL GROUP BY 1 ORDER BY 2 DESC, 1"  # noqa: S608
+        return dict(connection.execute(query).fetchall())
 
 
 def _without(entry: Mapping[str, Any], name: str) -> dict[str, Any]:

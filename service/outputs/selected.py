@@ -20,14 +20,11 @@ from typing import Any
 from pipeline.model import Status
 from service.disk import FULL_BYTES, MAKE_ROOM, Disk, has_no_space
 from service.errors import NoSpaceError, NoSuchOutputError, SelectionBusyError, UnexpectedError
+from service.features.index import NAME as INDEX
 from service.outputs.catalogue import NAME as CATALOGUE
 from service.outputs.catalogue import read_catalogue
-from service.outputs.kinds import OUTPUTS
+from service.outputs.kinds import OUTPUTS, SELECTABLE
 
-OFFERED = frozenset(
-    {"buildings", "planes", "meshes", "cityjson", "geojson", "3dtiles-zip", "geopackage", "pmtiles", "cityjson-zip"}
-)
-"""Outputs of a selection. The others hold no buildings, are about the whole job, or name files of the run."""
 WAIT_S = 20.0
 """Seconds that a request waits for a selection; then the client is asked to come again."""
 _REFUSED = 3
@@ -83,7 +80,7 @@ class Selections:
         if (place / CATALOGUE).is_file():
             return place
         catalogue = read_catalogue(out_dir)
-        names = [name for name in catalogue.outputs if name in OFFERED]
+        names = [name for name in catalogue.outputs if name in SELECTABLE]
         if not names:
             raise catalogue.missing("buildings")
         asked = {
@@ -145,8 +142,8 @@ class Selections:
 
 def refuse_others(output_id: str) -> None:
     """Refuse an output that a selection cannot have; raises NoSuchOutputError."""
-    if output_id not in OFFERED:
-        offered = ", ".join(name for name in OUTPUTS if name in OFFERED)
+    if output_id not in SELECTABLE:
+        offered = ", ".join(SELECTABLE)
         raise NoSuchOutputError(f"{output_id[:80]} is not made for some statuses: leave out status, or use {offered}")
 
 
@@ -163,7 +160,7 @@ def write_selected(
         The folder cannot be written.
     """
     from pipeline.errors import NothingToShowError
-    from pipeline.runtime.selection import select_run
+    from pipeline.extras.publish.selection import select_run
     from service.outputs.assemble import write_outputs
     from service.outputs.published import formats_of, publish
 
@@ -180,6 +177,7 @@ def write_selected(
         shutil.rmtree(made / "3dtiles", ignore_errors=True)  # the zip file has its files
         (made / OUTPUTS["3dtiles"].filename).unlink(missing_ok=True)
         write_outputs(run, made, names)
+        (made / INDEX).unlink()  # no page shows a selection
         try:
             made.rename(place)
         except OSError:

@@ -5,23 +5,25 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
-import zlib
+import sqlite3
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from pipeline.export.building_points import building_points
 from pipeline.export.folders import POINTS_FOLDER
-from pipeline.export.obj_parts import lines_of_buildings
-from pipeline.export.point_files import TILESET
 from pipeline.export.solid_geometry import OVERHANGS
+from pipeline.extras.octree.building_points import building_points
+from pipeline.extras.octree.point_files import TILESET
+from pipeline.extras.publish.obj_parts import lines_of_buildings
 from service.errors import NoSuchBuildingError, NoSuchOutputError
-from service.outputs.building_index import FEATURES_NAME
-from service.outputs.building_pages import GONE, opened_index
+from service.features.index import GONE, NAME, RowIndex
+from service.features.pages import properties
 from service.outputs.single_glb import cut_glb
 
 ID_PATTERN = "^[a-z2-7]{24}$"
 """Pattern of a building_id."""
+SO_FAR_CITY = "city.jsonl"
+"""The city objects of a run that goes on: for each building its metadata on one line, its feature on the next."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -30,90 +32,83 @@ class StoredBuilding:
 
     building_id: str
     """The building."""
-    tile: str
-    """Its owner tile."""
-    mesh_path: str | None
-    """Its OBJ or GLB file, relative to the run directory; None without one."""
-    feature: dict[str, Any]
-    """Its GeoJSON feature."""
+    position: int
+    """Its position in the index."""
+    properties: dict[str, Any]
+    """Its columns."""
     planes: list[dict[str, Any]]
     """Its rows of the planes table without geometry."""
-    city_start: int
-    """Start of its line in the tile's CityJSONSeq file, in bytes."""
-    city_size: int
-    """Bytes of the line."""
+
+    @property
+    def tile(self) -> str:
+        """Its owner tile."""
+        return str(self.properties["tile"])
+
+    @property
+    def mesh_path(self) -> str | None:
+        """Its OBJ or GLB file, relative to the run directory; None without one."""
+        found: str | None = self.properties["mesh_path"]
+        return found
 
 
-def stored_building(out_dir: Path, building_id: str, *, native: bool = False) -> StoredBuilding:
-    """Look up one building.
-
-    Parameters
-    ----------
-    out_dir : Path
-        The folder of outputs.
-    building_id : str
-        As a client gave it.
-    native : bool
-        Whether the feature gets the tiles' own coordinates.
+def stored_building(index: RowIndex, building_id: str) -> StoredBuilding:
+    """Look up one building by an id as a client gave it.
 
     Raises
     ------
     NoSuchBuildingError
         No building has this id.
     NoSuchOutputError
-        The outputs are gone.
+        The index is gone.
     """
-    row = None
     if re.fullmatch(ID_PATTERN, building_id):
-        with opened_index(out_dir) as connection:
-            row = connection.execute(
-                "SELECT tile.name, mesh_path, start, size, native, city_start, city_size, planes"
-                " FROM key JOIN building USING (place) JOIN tile ON tile.tile = key.tile WHERE key.building_id = ?",
-                (building_id,),
-            ).fetchone()
-    if row is None:
-        raise NoSuchBuildingError(f"the results of this job hold no building {building_id[:80]!r}")
-    tile, mesh_path, start, size, geometry, city_start, city_size, planes = row
-    try:
-        with (out_dir / FEATURES_NAME).open("rb") as stream:
-            stream.seek(start)
-            feature: dict[str, Any] = json.loads(stream.read(size))
-    except FileNotFoundError:
-        raise NoSuchOutputError(GONE) from None
-    if native:
-        feature["geometry"] = json.loads(geometry)
-    return StoredBuilding(
-        building_id=building_id,
-        tile=tile,
-        mesh_path=mesh_path,
-        feature=feature,
-        planes=json.loads(zlib.decompress(planes)),
-        city_start=city_start,
-        city_size=city_size,
-    )
+        with index.opened() as connection:
+            found = _rows(index, connection, "buildings", "id = ?", building_id)
+            if found:
+                # a dot and a number follow the id of the building
+                within = (f"{building_id}.", f"{building_id}/")
+                planes = _rows(index, connection, "planes", "id > ? AND id < ?", *within)
+                ((position, columns),) = found
+                return StoredBuilding(
+                    building_id=building_id,
+                    position=position,
+                    properties=columns,
+                    planes=[
+                        {name: value for name, value in plane.items() if name not in {"building_id", "tile"}}
+                        for _, plane in sorted(planes, key=lambda entry: entry[1]["plane_id"])
+                    ],
+                )
+    raise NoSuchBuildingError(f"the results of this job hold no building {building_id[:80]!r}")
 
 
-def building_decisions(out_dir: Path, building_id: str) -> list[dict[str, Any]]:
+def _rows(
+    index: RowIndex, connection: sqlite3.Connection, table: str, where: str, *values: str
+) -> list[tuple[int, dict[str, Any]]]:
+    """Positions and properties of some rows."""
+    kinds = index.kinds(table)
+    columns = ", ".join(f'"{name}"' for name in kinds)
+    rows = connection.execute(f"SELECT position, {columns} FROM {table} WHERE {where}", values)  # noqa: S608 - our own words
+    return [(position, properties(kinds, row)) for position, *row in rows]
+
+
+def building_decisions(run_dir: Path, building: StoredBuilding) -> list[dict[str, Any]]:
     """What was checked and tried for one building, in this order; empty if its process ended before.
 
     Raises
     ------
-    NoSuchBuildingError
-        No building has this id.
     NoSuchOutputError
-        The outputs are gone, or were made by a version that recorded no decisions.
+        The files are gone, or the job was made by a version that recorded no decisions.
     """
-    with opened_index(out_dir) as connection:
-        (recorded,) = connection.execute("SELECT count(*) FROM sqlite_master WHERE name = 'decision'").fetchone()
-        if not recorded:
-            raise NoSuchOutputError("this job was made by a version that recorded no decisions: submit it again")
-        row = connection.execute(
-            "SELECT entries FROM key LEFT JOIN decision USING (place) WHERE building_id = ?", (building_id,)
-        ).fetchone()
-    if row is None:
-        raise NoSuchBuildingError(f"the results of this job hold no building {building_id[:80]!r}")
-    entries: list[dict[str, Any]] = [] if row[0] is None else json.loads(zlib.decompress(row[0]))
-    return entries
+    import pyarrow.parquet as pq
+
+    from pipeline.export.decisions import decisions_path
+
+    path = run_dir / decisions_path(building.tile)
+    if not path.is_file():
+        raise NoSuchOutputError("this job was made by a version that recorded no decisions: submit it again")
+    found = pq.read_table(path, filters=[("building_id", "=", building.building_id)], partitioning=None)
+    rows: list[dict[str, Any]] = found.drop_columns(["building_id"]).to_pylist()
+    return rows
 
 
 def building_obj(run_dir: Path, building: StoredBuilding, lod: str | None = None) -> Iterator[str]:
@@ -156,11 +151,11 @@ def _mesh_file(run_dir: Path, building: StoredBuilding, wanted: str, lod: str | 
     NoSuchBuildingError
         There is none of this kind or level.
     """
-    name, properties = building.building_id, building.feature["properties"]
-    own_lod = properties["lod"]
+    name, columns = building.building_id, building.properties
+    own_lod = columns["lod"]
     if building.mesh_path is None:
         if own_lod is None:
-            why = properties["reason"]
+            why = columns["reason"]
             raise NoSuchBuildingError(f"building {name} has no model ({why}), so it has no mesh")
         raise NoSuchBuildingError(f"the request left out the meshes: use CityJSON for building {name}")
     kind = building.mesh_path.rpartition(".")[2]
@@ -172,7 +167,7 @@ def _mesh_file(run_dir: Path, building: StoredBuilding, wanted: str, lod: str | 
         # named by pipeline.export.tile.mesh_path
         other = path.with_stem(f"{path.stem}-lod{str(lod).replace('.', '')}")
         # the file of a level has the next coarser model of buildings that are not modelled in it
-        finest = own_lod if properties.get("overhang_source") is None else OVERHANGS
+        finest = own_lod if columns.get("overhang_source") is None else OVERHANGS
         if not other.is_file() or str(lod) > finest:
             raise NoSuchBuildingError(f"building {name} has no mesh in LoD{lod}; its own is in LoD{own_lod}")
         return other
@@ -203,42 +198,53 @@ def points_of_building(run_dir: Path, building: StoredBuilding) -> bytes:
     return found
 
 
-def cityjson_path(run_dir: Path, tile: str) -> Path:
-    """The CityJSONSeq file of a tile."""
-    return run_dir / "cityjson" / f"tile={tile}" / "part-0.city.jsonl"
-
-
 def building_cityjson(run_dir: Path, building: StoredBuilding) -> dict[str, Any]:
-    """A complete CityJSON document of one building: its objects, vertices, transform and extent.
+    """A complete CityJSON document of one building of a finished run.
 
     Raises
     ------
     NoSuchBuildingError
         Its file is gone.
     """
-    path = cityjson_path(run_dir, building.tile)
+    path = run_dir / "cityjson" / f"tile={building.tile}" / "part-0.city.jsonl"
+    wanted = f'"{building.building_id}"'.encode()
     try:
         with path.open("rb") as stream:
-            document: dict[str, Any] = json.loads(stream.readline())
-            stream.seek(building.city_start)
-            feature = json.loads(stream.read(building.city_size))
+            header = stream.readline()
+            for line in stream:
+                if wanted in line and json.loads(line)["id"] == building.building_id:
+                    return city_document(json.loads(header), json.loads(line))
     except FileNotFoundError:
-        raise NoSuchBuildingError(
-            f"the model of building {building.building_id} is no longer in the state folder: submit the job again"
-        ) from None
-    metadata = {**document["metadata"], "title": f"building {building.building_id}"}
+        pass
+    raise NoSuchBuildingError(
+        f"the model of building {building.building_id} is no longer in the state folder: submit the job again"
+    )
+
+
+def cityjson_so_far(folder: Path, building: StoredBuilding) -> dict[str, Any]:
+    """The same of a building of a run that goes on; raises NoSuchOutputError if the files are gone."""
+    with RowIndex(folder / NAME).opened() as connection:
+        query = "SELECT start, size FROM city WHERE id = ?"
+        start, size = connection.execute(query, (building.building_id,)).fetchone()
+    try:
+        with (folder / SO_FAR_CITY).open("rb") as stream:
+            stream.seek(start)
+            header, feature = stream.read(size).splitlines()
+    except FileNotFoundError:
+        raise NoSuchOutputError(GONE) from None
+    return city_document(json.loads(header), json.loads(feature))
+
+
+def city_document(header: dict[str, Any], feature: dict[str, Any]) -> dict[str, Any]:
+    """A CityJSON document of one feature of a sequence: its objects, vertices, transform and extent."""
+    metadata = {**header["metadata"], "title": f"building {feature['id']}"}
     metadata.pop("geographicalExtent", None)
     if feature["vertices"]:
-        scale, translate = document["transform"]["scale"], document["transform"]["translate"]
+        scale, translate = header["transform"]["scale"], header["transform"]["translate"]
         corners = [
             (extreme(vertex[axis] for vertex in feature["vertices"]) * scale[axis] + translate[axis])
             for extreme in (min, max)
             for axis in range(3)
         ]
         metadata["geographicalExtent"] = [round(corner, 6) for corner in corners]
-    return {
-        **document,
-        "metadata": metadata,
-        "CityObjects": feature["CityObjects"],
-        "vertices": feature["vertices"],
-    }
+    return {**header, "metadata": metadata, "CityObjects": feature["CityObjects"], "vertices": feature["vertices"]}

@@ -50,6 +50,25 @@ def document(model: type[BaseModel], description: str, example: Any, **more: Any
     }
 
 
+FEATURE_EXAMPLE: dict[str, Any] = {
+    "type": "Feature",
+    "id": "3givd2mvtyerfjxv2yytjbmi",
+    "geometry": {
+        "type": "Polygon",
+        "coordinates": [[[9.9967, 53.5603], [9.9968, 53.5602], [9.9969, 53.5603], [9.9967, 53.5603]]],
+    },
+    "properties": {
+        "building_id": "3givd2mvtyerfjxv2yytjbmi",
+        "status": "ok",
+        "reason": None,
+        "roof_type": "gable",
+        "height_m": 7.618,
+        "volume_m3": 965.377,
+        "tile": "x5660_y59350",
+    },
+}
+"""A building."""
+
 STATUS_EXAMPLE = {
     "jobID": JOB_ID,
     "id": JOB_ID,

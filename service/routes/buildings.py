@@ -8,27 +8,17 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from enum import StrEnum
 from typing import Annotated, Any, Literal
-from urllib.parse import urlencode
 
 from fastapi import APIRouter, Depends, Path, Query, Request, Response
-from fastapi.responses import StreamingResponse
 from pydantic import AfterValidator
 
 from pipeline.model import Reason, RoofType, Status
-from service.errors import NoSuchBuildingError, ResultNotReadyError
-from service.outputs.building_index import FEATURES_NAME
-from service.outputs.building_pages import (
-    MAX_LIMIT,
-    MAX_OFFSET,
-    BuildingPage,
-    BuildingQuery,
-    CoordinateChoice,
-    building_page,
-    checked_choice,
-    parsed_bbox,
-)
+from service.errors import NoSuchBuildingError, RequestError, ResultNotReadyError
+from service.features.index import RowIndex
+from service.features.pages import Condition, among, bounded_by, collected, feature_texts, sorted_page
 from service.outputs.catalogue import ResultsCrs
 from service.outputs.kinds import CITYJSON, GEOJSON, GLB, OBJ
 from service.outputs.single_building import (
@@ -37,48 +27,44 @@ from service.outputs.single_building import (
     building_decisions,
     building_glb,
     building_obj,
+    cityjson_so_far,
     points_of_building,
     stored_building,
 )
-from service.routes.answers import JOB_ID, document, header, problems, reference
+from service.routes.answers import FEATURE_EXAMPLE, JOB_ID, document, header, problems, reference
 from service.routes.bound import Base
 from service.routes.finished_jobs import FinishedJob, FinishedRun, ReadableRun
 from service.routes.negotiation import preferred
 from service.routes.results import FAILED
 from service.wire import patterns
-from service.wire.base import link, respond
+from service.wire.base import link, page_links, respond
 from service.wire.buildings import CityJson, Decision, Decisions, Feature, FeaturePage
-from service.wire.queries import Statuses, entry_of, words
+from service.wire.queries import Statuses, entry_of, window, words
 
 router = APIRouter(tags=["results"])
 
 _FORMATS: Mapping[str, str] = {"json": GEOJSON, "obj": OBJ, "glb": GLB, "cityjson": CITYJSON}
-_CRS84 = CoordinateChoice.CRS84_URI.value
+_CRS84 = "http://www.opengis.net/def/crs/OGC/1.3/CRS84"
 
-_FEATURE_EXAMPLE: dict[str, Any] = {
-    "type": "Feature",
-    "id": "3givd2mvtyerfjxv2yytjbmi",
-    "geometry": {
-        "type": "Polygon",
-        "coordinates": [[[9.9967, 53.5603], [9.9968, 53.5602], [9.9969, 53.5603], [9.9967, 53.5603]]],
-    },
-    "properties": {
-        "building_id": "3givd2mvtyerfjxv2yytjbmi",
-        "status": "ok",
-        "reason": None,
-        "roof_type": "gable",
-        "height_m": 7.618,
-        "volume_m3": 965.377,
-        "tile": "x5660_y59350",
-    },
-}
+
+class CoordinateChoice(StrEnum):
+    """The coordinates of a request."""
+
+    CRS84 = "CRS84"
+    """Longitude and latitude in WGS 84."""
+    CRS84_URI = _CRS84
+    """The same by its full name."""
+    NATIVE = "native"
+    """Easting and northing of the tiles, in their own units."""
+
+
 _PAGE_EXAMPLE = {
     "type": "FeatureCollection",
     "numberMatched": 154,
     "numberReturned": 1,
     "complete": True,
     "links": [{"href": f"http://127.0.0.1:8000/jobs/{JOB_ID}/buildings?limit=1", "rel": "self", "type": GEOJSON}],
-    "features": [_FEATURE_EXAMPLE],
+    "features": [FEATURE_EXAMPLE],
 }
 _DECISIONS_EXAMPLE = {
     "building_id": "3givd2mvtyerfjxv2yytjbmi",
@@ -134,7 +120,7 @@ class _Asked:
         str | None,
         Query(
             description="Only buildings whose footprint's bounds meet this window: west,south,east,north. Buildings "
-            "without a footprint never do. Split a window over the 180th meridian into two requests.",
+            "without a footprint never do. In degrees it may cross the 180th meridian.",
             examples=["9.99,53.55,10.01,53.57"],
             json_schema_extra=patterns.stated(patterns.WINDOW),
         ),
@@ -146,43 +132,23 @@ class _Asked:
     status: Annotated[Statuses, Query(description=_any_of(Status))] = None
     roof_type: Annotated[_RoofTypes, Query(description=_any_of(RoofType))] = None
     reason: Annotated[_Reasons, Query(description=_any_of(Reason))] = None
-    limit: Annotated[int, Query(ge=1, le=MAX_LIMIT, description="Maximum number of buildings of the page.")] = 100
-    offset: Annotated[int, Query(ge=0, le=MAX_OFFSET, description="Number of buildings before the page.")] = 0
+    limit: Annotated[int, Query(ge=1, le=10_000, description="Maximum number of buildings of the page.")] = 100
+    offset: Annotated[int, Query(ge=0, le=10**12, description="Number of buildings before the page.")] = 0
 
-    def query(self, known: ResultsCrs, *, by_arrival: bool) -> BuildingQuery:
-        """The query, in the coordinates of the results."""
-        bbox_native = checked_choice(self.bbox_crs, known, "bbox-crs")
-        return BuildingQuery(
-            bbox=None if self.bbox is None else parsed_bbox(self.bbox, native=bbox_native),
-            bbox_native=bbox_native,
-            native=checked_choice(self.crs, known, "crs"),
-            statuses=tuple(self.status or ()),
-            roof_types=tuple(self.roof_type or ()),
-            reasons=tuple(self.reason or ()),
-            limit=self.limit,
-            offset=self.offset,
-            by_arrival=by_arrival,
-        )
-
-    def again(self, label: str | None, start: int) -> str:
-        """The same query, starting at another building."""
-        lists = (("status", self.status), ("roof_type", self.roof_type), ("reason", self.reason))
-        given = [
-            ("method", label),
-            ("bbox", self.bbox),
-            ("bbox-crs", None if self.bbox_crs is None else self.bbox_crs.value),
-            ("crs", None if self.crs is None else self.crs.value),
-            *((name, ",".join(values or ()) or None) for name, values in lists),
-            ("limit", self.limit),
-            ("offset", start),
-        ]
-        return urlencode([(name, value) for name, value in given if value is not None])
+    def conditions(self, known: ResultsCrs) -> list[Condition]:
+        """What buildings must meet."""
+        native = _is_native(self.bbox_crs, known, "bbox-crs")
+        chosen = (("status", self.status), ("roof_type", self.roof_type), ("reason", self.reason))
+        found = [among(column, allowed) for column, allowed in chosen if allowed]
+        if self.bbox is not None:
+            found.append(bounded_by(window(self.bbox, in_degrees=not native), native=native))
+        return found
 
 
 @router.get(
     "/jobs/{jobID}/buildings",
     summary="Buildings of a job",
-    response_class=StreamingResponse,
+    response_class=Response,
     responses={
         200: {
             "description": "A page of buildings, sorted by building_id. One without an outline has a null geometry. "
@@ -198,26 +164,35 @@ def buildings(request: Request, finished: ReadableRun, base: Base, asked: Annota
     """List buildings by window, status, roof type and reason, in pages; also those that a running job has so far."""
     preferred(request.headers.get("accept"), [GEOJSON])
     known = finished.catalogue.crs
-    query = asked.query(known, by_arrival=not finished.is_complete)
+    conditions, native = asked.conditions(known), _is_native(asked.crs, known, "crs")
+    matched, positions = 0, list[int]()
+    texts: Iterator[bytes] = iter(())
     if finished.has_buildings_yet:
-        page = building_page(finished.out_dir, query)
-    else:
-        page = BuildingPage(matched=0, parts=(), path=finished.out_dir / FEATURES_NAME)
+        # a list that grows does so at its end
+        order = "id" if finished.is_complete else "position"
+        matched, positions = sorted_page(finished.index, conditions, by=order, limit=asked.limit, offset=asked.offset)
+        texts = _texts(finished.index, positions, native=native)
     collection = f"{base}/jobs/{finished.job.job_id}"
-    limit, offset = asked.limit, asked.offset
+    given = [entry for entry in request.query_params.multi_items() if entry[0] not in {"limit", "offset", "method"}]
+    found = matched - asked.offset if positions else 0
+    links = page_links(
+        f"{collection}/buildings", [*given, ("method", finished.label)], found, asked.limit, asked.offset, GEOJSON
+    )
+    links.append(link(collection, "collection", "The job"))
+    members = {
+        "numberMatched": matched,
+        "numberReturned": len(positions),
+        **_state(finished),
+        **_crs_members(known, native=native),
+        "links": [one.model_dump() for one in links],
+    }
+    headers = _headers(finished, native=native)
+    return Response(b"".join(collected(members, texts)), media_type=GEOJSON, headers=headers)
 
-    def at(start: int, rel: str, title: str) -> dict[str, Any]:
-        href = f"{collection}/buildings?{asked.again(finished.label, start)}"
-        return link(href, rel, title, GEOJSON).model_dump()
 
-    links = [at(offset, "self", "These buildings"), link(collection, "collection", "The job").model_dump()]
-    if offset + len(page.parts) < page.matched and page.parts:
-        links.append(at(offset + limit, "next", "The next buildings"))
-    if offset > 0:
-        links.append(at(max(0, offset - limit), "prev", "The buildings before"))
-    members = {**_state(finished), **_crs_members(known, native=query.native), "links": links}
-    headers = _headers(finished, native=query.native)
-    return StreamingResponse(page.chunks(members), media_type=GEOJSON, headers=headers)
+def _texts(index: RowIndex, positions: Sequence[int], *, native: bool) -> Iterator[bytes]:
+    """Buildings as GeoJSON, in degrees or in the coordinates of the tiles."""
+    return feature_texts(index, "buildings", positions, (lambda shapes: shapes) if native else None)
 
 
 @router.get(
@@ -228,7 +203,7 @@ def buildings(request: Request, finished: ReadableRun, base: Base, asked: Annota
         200: {
             "description": "The record with its planes; or its mesh; or a CityJSON document of its own.",
             "content": {
-                GEOJSON: {"schema": reference(Feature), "example": _FEATURE_EXAMPLE},
+                GEOJSON: {"schema": reference(Feature), "example": FEATURE_EXAMPLE},
                 OBJ: {"schema": {"type": "string"}},
                 GLB: {"schema": {"type": "string", "format": "binary"}},
                 CITYJSON: {"schema": reference(CityJson)},
@@ -257,8 +232,8 @@ def building(
     media_type = (
         preferred(request.headers.get("accept"), list(_FORMATS.values())) if wanted is None else _FORMATS[wanted]
     )
-    native = checked_choice(crs, finished.catalogue.crs, "crs")
-    found = _found(finished, building_id, media_type, native=native)
+    native = _is_native(crs, finished.catalogue.crs, "crs")
+    found = _found(finished, building_id, media_type)
     headers = _headers(finished, native=native or media_type != GEOJSON)
     if media_type == OBJ:
         lines = building_obj(finished.run_dir, found, lod)
@@ -269,7 +244,8 @@ def building(
         headers.pop("Content-Crs", None)  # metres from an origin, which the file states
         headers["Content-Disposition"] = f'inline; filename="{found.building_id}.glb"'
     elif media_type == CITYJSON:
-        content = _json(building_cityjson(finished.run_dir, found))
+        made = building_cityjson if finished.is_complete else cityjson_so_far
+        content = _json(made(finished.run_dir, found))
         headers["Content-Disposition"] = f'inline; filename="{found.building_id}.city.json"'
     else:
         content = _json(_feature(found, finished, base, native=native))
@@ -296,7 +272,7 @@ def points(
 ) -> Response:
     """The points of one building as GLB, if the job was requested with points."""
     preferred(request.headers.get("accept"), [GLB])
-    found = stored_building(finished.out_dir, building_id)
+    found = stored_building(finished.index, building_id)
     content = points_of_building(finished.run_dir, found)
     headers = {
         "Cache-Control": "private, no-cache",
@@ -317,7 +293,7 @@ def points(
 )
 def decisions(finished: FinishedRun, base: Base, building_id: _BuildingId) -> Response:
     """The figures that decided on a building's model, each with its limit, and the forms that were tried."""
-    entries = building_decisions(finished.out_dir, building_id)
+    entries = building_decisions(finished.run_dir, stored_building(finished.index, building_id))
     place = f"{base}/jobs/{finished.job.job_id}/buildings/{building_id}"
     answer = Decisions(
         building_id=building_id,
@@ -330,7 +306,7 @@ def decisions(finished: FinishedRun, base: Base, building_id: _BuildingId) -> Re
     return respond(answer, headers={"Cache-Control": "private, no-cache"})
 
 
-def _found(finished: FinishedJob, building_id: str, media_type: str, *, native: bool) -> StoredBuilding:
+def _found(finished: FinishedJob, building_id: str, media_type: str) -> StoredBuilding:
     """The building of a job.
 
     Raises
@@ -345,7 +321,7 @@ def _found(finished: FinishedJob, building_id: str, media_type: str, *, native: 
         raise ResultNotReadyError(f"there are no meshes {later}: use f=cityjson, or ask again when it is over")
     try:
         if finished.has_buildings_yet:
-            return stored_building(finished.out_dir, building_id, native=native)
+            return stored_building(finished.index, building_id)
         raise NoSuchBuildingError(building_id)  # noqa: TRY301
     except NoSuchBuildingError:
         if finished.is_complete:
@@ -367,12 +343,30 @@ def _feature(found: StoredBuilding, finished: FinishedJob, base: str, *, native:
     if found.mesh_path is not None:
         kind = found.mesh_path.rpartition(".")[2]
         links.append(link(finished.address(place, f=kind), "alternate", f"As {kind.upper()}", _FORMATS[kind]))
+    (text,) = _texts(finished.index, [found.position], native=native)
+    feature = json.loads(text)
     return {
-        **found.feature,
-        "properties": {**found.feature["properties"], "planes": found.planes},
+        **feature,
+        "properties": {**feature["properties"], "planes": found.planes},
         **_crs_members(finished.catalogue.crs, native=native),
         "links": [entry.model_dump() for entry in links],
     }
+
+
+def _is_native(choice: CoordinateChoice | None, crs: ResultsCrs, parameter: str) -> bool:
+    """Whether the tiles' own coordinates are requested; they are the only ones if the CRS is unknown.
+
+    Raises
+    ------
+    RequestError
+        WGS 84 is requested, but the CRS of the tiles is unknown.
+    """
+    if crs.is_known or choice is CoordinateChoice.NATIVE:
+        return choice is CoordinateChoice.NATIVE
+    if choice is not None:
+        fault = f"query {parameter} is {choice.value}, but the CRS of the tiles is unknown or local"
+        raise RequestError([f"{fault}: use native, or leave it out"])
+    return True
 
 
 def _crs_members(crs: ResultsCrs, *, native: bool) -> dict[str, Any]:

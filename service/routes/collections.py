@@ -5,6 +5,7 @@ Modules that read Parquet are imported in the functions that need them: the star
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import datetime as dt
 import json
@@ -17,13 +18,22 @@ from fastapi import APIRouter, Depends, Path, Query, Request, Response
 from pydantic import AfterValidator
 
 from service.auth import Principal
-from service.errors import NoSuchCollectionError, NoSuchJobError, NoSuchOutputError, RequestError, ResultNotReadyError
-from service.features.runs import ServedRun, split_id
+from service.errors import (
+    NoSuchCollectionError,
+    NoSuchFeatureError,
+    NoSuchJobError,
+    NoSuchOutputError,
+    RequestError,
+    ResultNotReadyError,
+)
+from service.features.index import TABLES
+from service.features.pages import Search, ShapeTest, acquired_in, collected, feature_texts
+from service.features.runs import OpenRun, PublishedRun, split_id
 from service.files import StateFolder, is_id
 from service.jobs import Job, JobStatus
 from service.outputs.kinds import GEOJSON
 from service.problems import JobFailedError
-from service.routes.answers import document, header, problems, reference
+from service.routes.answers import FEATURE_EXAMPLE, document, header, problems, reference
 from service.routes.bound import Base, Folder, Reader, Store
 from service.routes.finished_jobs import results_of
 from service.routes.negotiation import preferred
@@ -41,12 +51,10 @@ from service.wire.features import (
     SpatialExtent,
     TemporalExtent,
 )
-from service.wire.queries import interval
+from service.wire.queries import interval, is_interval, window
 
 if TYPE_CHECKING:
-    from service.features.cql2 import Filter
-    from service.features.pages import FeatureQuery
-    from service.features.tables import Layer, OpenRun
+    from service.features.tables import Layer
 
 FEATURES = "http://www.opengis.net/spec/ogcapi-features-"
 CQL2 = "http://www.opengis.net/spec/cql2/1.0/conf/"
@@ -93,19 +101,13 @@ _COLLECTION_EXAMPLE: dict[str, Any] = {
     "storageCrs": "http://www.opengis.net/def/crs/EPSG/0/28992",
     "links": [{"href": "http://127.0.0.1:8000/collections/delft.buildings/items", "rel": "items", "type": GEOJSON}],
 }
-_FEATURE_EXAMPLE: dict[str, Any] = {
-    "type": "Feature",
-    "id": "3givd2mvtyerfjxv2yytjbmi",
-    "geometry": {"type": "Polygon", "coordinates": [[[4.36, 52.0], [4.37, 52.0], [4.37, 52.01], [4.36, 52.0]]]},
-    "properties": {"building_id": "3givd2mvtyerfjxv2yytjbmi", "status": "ok", "height_m": 7.618},
-}
 _PAGE_EXAMPLE = {
     "type": "FeatureCollection",
     "timeStamp": "2026-03-01T09:30:00.000Z",
     "numberMatched": 257,
     "numberReturned": 1,
     "links": [{"href": "http://127.0.0.1:8000/collections/delft.buildings/items", "rel": "self", "type": GEOJSON}],
-    "features": [_FEATURE_EXAMPLE],
+    "features": [FEATURE_EXAMPLE],
 }
 
 
@@ -116,7 +118,7 @@ _PAGE_EXAMPLE = {
 class Catalogue:
     """The runs that a caller may read."""
 
-    published: Mapping[str, ServedRun]
+    published: Mapping[str, PublishedRun]
     """Those of the operator."""
     store: JobStore
     """Those of jobs."""
@@ -125,48 +127,37 @@ class Catalogue:
     caller: Principal
     """The caller."""
 
-    def run(self, name: str) -> ServedRun:
-        """The run with a name. Only names of the settings and ids of jobs ever become a path.
+    def opened(self, collection_id: str) -> tuple[OpenRun, str]:
+        """The run and the table of a collection. Only names of the settings and ids of jobs ever become a path.
 
         Raises
         ------
         NoSuchCollectionError
             There is none, or it belongs to another key.
         """
+        name, table = split_id(collection_id)
         if name in self.published:
-            return self.published[name]
+            return self.published[name].opened(), table
         job_id = name.partition(".")[0]
         if is_id(job_id):
-            try:
-                job = self.store.get(job_id, owner=self.caller.owner)
-            except NoSuchJobError:
-                job = None
-            found = [run for run in self.of_job(job) if run.name == name] if job is not None else []
-            if found:
-                return found[0]
+            with contextlib.suppress(NoSuchJobError):
+                for run in self.of_job(self.store.get(job_id, owner=self.caller.owner)):
+                    if run.name == name:
+                        return run, table
         raise NoSuchCollectionError(
             f"there is no run {name[:80]!r} with collections: /collections lists all; those of a job are there when "
             "it is over, those of a comparison are JOB.METHOD"
         )
 
-    def of_job(self, job: Job) -> list[ServedRun]:
+    def of_job(self, job: Job) -> Iterator[OpenRun]:
         """The runs of a job that is over: several of a comparison, none of one without buildings."""
-        if not job.request.has_buildings:
-            return []
-        finished = results_of(job, self.folder)
-        index_dir = self.folder.attempt(job.job_id, job.attempt) / "features"
-        runs = [finished.run(label) for label in finished.catalogue.runs] or [finished]
-        return [
-            ServedRun(
-                name=job.job_id if one.label is None else f"{job.job_id}.{one.label}",
-                place=str(one.run_dir),
-                index_dir=index_dir,
-                is_job=True,
-            )
-            for one in runs
-        ]
+        if job.request.has_buildings:
+            finished = results_of(job, self.folder)
+            for one in [finished.run(label) for label in finished.catalogue.runs] or [finished]:
+                name = job.job_id if one.label is None else f"{job.job_id}.{one.label}"
+                yield OpenRun(name=name, version=name, index=one.index, is_job=True)
 
-    def page(self, limit: int, offset: int) -> tuple[list[ServedRun], int]:
+    def page(self, limit: int, offset: int) -> tuple[list[OpenRun], int]:
         """Published runs on the first page, then those of jobs; and the number of jobs found, up to `limit` + 1."""
         criteria = JobFilter(
             owner=self.caller.owner,
@@ -176,12 +167,10 @@ class Catalogue:
             offset=offset,
         )
         jobs = self.store.list(criteria)
-        found = list(self.published.values()) if offset == 0 else []
-        for job in jobs[:limit]:
-            try:
-                found += self.of_job(job)
-            except _NOT_SHOWN:
-                continue  # its files are gone
+        found: list[OpenRun] = []
+        for one in [*(self.published.values() if offset == 0 else ()), *jobs[:limit]]:
+            with contextlib.suppress(*_NOT_SHOWN):  # its files are gone, or its CRS is unknown
+                found += [one.opened()] if isinstance(one, PublishedRun) else self.of_job(one)
         return found, len(jobs)
 
 
@@ -190,14 +179,6 @@ def _catalogue(request: Request, store: Store, folder: Folder, caller: Reader) -
 
 
 _Runs = Annotated[Catalogue, Depends(_catalogue)]
-
-
-def _opened(runs: Catalogue, collection_id: str) -> tuple[OpenRun, Layer]:
-    """The run and the table of a collection."""
-    from service.features.tables import LAYERS, open_run
-
-    name, table = split_id(collection_id)
-    return open_run(runs.run(name)), LAYERS[table]
 
 
 # --- collections -----------------------------------------------------------------------------------------------------
@@ -215,16 +196,8 @@ def collections(
     offset: Annotated[int, Query(ge=0, le=2**31 - 1, description="Number of jobs before the page.")] = 0,
 ) -> Response:
     """List published runs and runs of jobs, each with its tables; a run whose CRS is unknown has no collections."""
-    from service.features.tables import layers, open_run
-
     found, n_jobs = runs.page(limit, offset)
-    listed: list[Collection] = []
-    for served in found:
-        try:
-            run = open_run(served)
-        except _NOT_SHOWN:
-            continue
-        listed += [_described(run, layer, base) for layer in layers()]
+    listed = [_described(run, table, base) for run in found for table in TABLES]
     links = page_links(f"{base}/collections", [], n_jobs, limit, offset)
     return respond(Collections(links=links, collections=listed))
 
@@ -236,12 +209,14 @@ def collections(
 )
 def collection(runs: _Runs, base: Base, collection_id: _CollectionId) -> Response:
     """Describe a collection: its extent, its coordinate reference systems, its links."""
-    return respond(_described(*_opened(runs, collection_id), base))
+    return respond(_described(*runs.opened(collection_id), base))
 
 
-def _described(run: OpenRun, layer: Layer, base: str) -> Collection:
-    totals = run.totals(layer.table)
-    place = f"{base}/collections/{run.run.collection_id(layer.table)}"
+def _described(run: OpenRun, table: str, base: str) -> Collection:
+    from service.features.tables import LAYERS
+
+    totals, layer, name = run.index.totals(table), LAYERS[table], run.collection_id(table)
+    place = f"{base}/collections/{name}"
     bounds = None if totals.bounds is None else run.crs.outside(totals.bounds, run.crs.named(None, "crs"))
     spatial = None if bounds is None else SpatialExtent(bbox=[[round(value, 7) for value in bounds]], crs=_CRS84)
     temporal = TemporalExtent(interval=[list(totals.times)]) if totals.times != (None, None) else None
@@ -251,13 +226,14 @@ def _described(run: OpenRun, layer: Layer, base: str) -> Collection:
         link(f"{place}/queryables", f"{RELATIONS}queryables", "The properties for filters", SCHEMA_TYPE),
         link(f"{place}/schema", "describedby", "The JSON schema of the features", SCHEMA_TYPE),
     ]
-    if (run.licence or "").startswith(("http://", "https://")):
-        links.append(Link(href=str(run.licence), rel="license", title="Licence of the source data"))
-    licence = f"; licence of the source data: {run.licence}" if run.licence else ""
+    licence = run.index.facts["licence"]
+    if licence.startswith(("http://", "https://")):
+        links.append(Link(href=licence, rel="license", title="Licence of the source data"))
+    stated = f"; licence of the source data: {licence}" if licence else ""
     return Collection(
-        id=run.run.collection_id(layer.table),
-        title=f"{run.run.name}: {layer.table}",
-        description=layer.title + _elevations(run, layer) + licence,
+        id=name,
+        title=f"{run.name}: {table}",
+        description=layer.title + _elevations(run, layer) + stated,
         itemType="feature",
         extent=Extent(spatial=spatial, temporal=temporal) if spatial or temporal else None,
         crs=run.crs.uris,
@@ -271,7 +247,7 @@ def _elevations(run: OpenRun, layer: Layer) -> str:
     from pipeline.export.columns import ELEVATIONS
     from pipeline.io.crs_units import unit_name
 
-    unit_m = run.crs.vertical_unit_m
+    unit_m = run.crs.vertical_unit_m or 1.0
     if unit_m == 1.0 or not ELEVATIONS[layer.table]:
         return ""
     return f"; elevations that are properties are in units of {unit_m:.12g} m ({unit_name(unit_m)})"
@@ -306,12 +282,14 @@ def schema(runs: _Runs, base: Base, collection_id: _CollectionId) -> Response:
 
 
 def _schema(runs: Catalogue, base: str, collection_id: str, kind: Literal["queryables", "schema"]) -> Response:
-    run, layer = _opened(runs, collection_id)
-    name = run.run.collection_id(layer.table)
+    from service.features.tables import LAYERS
+
+    run, table = runs.opened(collection_id)
+    name, layer = run.collection_id(table), LAYERS[table]
     found = JsonSchema(
         **{"$schema": _SCHEMA, "$id": f"{base}/collections/{name}/{kind}"},
         type="object",
-        title=f"{run.run.name}: {layer.table}",
+        title=f"{run.name}: {table}",
         additionalProperties=kind == "schema",
         properties=layer.filter_schema(run.crs) if kind == "queryables" else layer.feature_schema(run.crs),
     )
@@ -319,11 +297,6 @@ def _schema(runs: Catalogue, base: str, collection_id: str, kind: Literal["query
 
 
 # --- features --------------------------------------------------------------------------------------------------------
-
-
-def _is_interval(text: str | None) -> str | None:
-    interval(text)
-    return text
 
 
 @dataclasses.dataclass(frozen=True)
@@ -346,7 +319,7 @@ class _Asked:
     crs: _Crs = None
     datetime: Annotated[
         str | None,
-        AfterValidator(_is_interval),
+        AfterValidator(is_interval),
         Query(
             description="Only features whose points were acquired then: an RFC 3339 time, or `a/b`, `../b`, `a/..`. "
             "Features without such times are always there.",
@@ -392,38 +365,52 @@ _PROPERTY_PARAMETERS = {
 }
 
 
-def _query(run: OpenRun, layer: Layer, asked: _Asked, given: Sequence[tuple[str, str]]) -> FeatureQuery:
-    """The query for a page; all of it is checked before anything is read."""
-    from service.features.coordinates import parsed_window
+def _search(run: OpenRun, table: str, asked: _Asked, given: Sequence[tuple[str, str]]) -> Search:
+    """The search of a request; all of it is checked before anything is read."""
     from service.features.cql2 import compiled, equality, parsed
-    from service.features.pages import FeatureQuery
 
     bbox_crs, filter_crs = run.crs.named(asked.bbox_crs, "bbox-crs"), run.crs.named(asked.filter_crs, "filter-crs")
-    unknown = [name for name, _ in given if name not in layer.queryables]
+    queryables = {name: kind for name, kind in run.index.kinds(table).items() if kind != "list"}
+    unknown = [name for name, _ in given if name not in queryables]
     if unknown:
         known = f"{', '.join(sorted(_NAMES))}, or a property of its queryables"
         raise RequestError([f"query {name[:80]!r} is not known: use {known}" for name in dict.fromkeys(unknown)])
     twice = {name: number for name, number in Counter(name for name, _ in given).items() if number > 1}
     if twice:
         raise RequestError([f"query {name} is given {number} times: give it once" for name, number in twice.items()])
-    filters: list[Filter] = [
-        compiled(equality(name, value, layer.queryables), layer.queryables, filter_crs) for name, value in given
-    ]
+    trees = [equality(name, value, queryables) for name, value in given]
     if asked.filter is not None:
-        filters.append(compiled(parsed(asked.filter, asked.filter_lang), layer.queryables, filter_crs))
-    boxes = None if asked.bbox is None else parsed_window(asked.bbox, bbox_crs)
+        trees.append(parsed(asked.filter, asked.filter_lang))
+    shapes: list[ShapeTest] = []
+    filters = [compiled(tree, queryables, filter_crs, shapes) for tree in trees]
+    boxes = None
+    near, near_crs = [one.window for one in filters if one.window is not None][:1], filter_crs
+    if asked.bbox is not None:
+        boxes = window(asked.bbox, in_degrees=bbox_crs.crs.is_geographic, northing_first=bbox_crs.is_northing_first)
+        near, near_crs = boxes, bbox_crs
+    windows = [run.crs.window(box, near_crs) for box in near]
+    times = [] if asked.datetime is None or table != "buildings" else [acquired_in(interval(asked.datetime))]
     selecting = (asked.bbox, bbox_crs.uri, asked.datetime, asked.filter, asked.filter_lang, filter_crs.uri, *given)
-    return FeatureQuery(
-        crs=run.crs.named(asked.crs, "crs"),
+    return Search(
+        version=run.version,
+        table=table,
+        key=json.dumps(selecting),
+        index=run.index,
+        crs=run.crs,
+        conditions=[*filters, *times],
+        shapes=shapes,
         boxes=boxes,
         boxes_crs=bbox_crs,
-        interval=None if asked.datetime is None else interval(asked.datetime),
-        filters=filters,
-        filter_crs=filter_crs,
-        key=json.dumps(selecting),
-        limit=asked.limit,
-        start=asked.start,
+        windows=None if not windows or None in windows else [box for box in windows if box is not None],
     )
+
+
+def _texts(run: OpenRun, table: str, positions: Sequence[int], crs: str | None) -> tuple[Iterator[bytes], str]:
+    """Features as GeoJSON in the CRS of a query parameter, and its URI."""
+    named = run.crs.named(crs, "crs")
+    is_stored = table == "buildings" and named.uri == _CRS84
+    written = None if is_stored else lambda shapes: run.crs.written(shapes, named)
+    return feature_texts(run.index, table, positions, written), named.uri
 
 
 @router.get(
@@ -445,35 +432,31 @@ def items(
     request: Request, runs: _Runs, base: Base, collection_id: _CollectionId, asked: Annotated[_Asked, Depends()]
 ) -> Response:
     """List features by window, time, property and filter, in pages."""
-    from service.features.pages import feature_page
-
     preferred(request.headers.get("accept"), [GEOJSON])
-    run, layer = _opened(runs, collection_id)
+    run, table = runs.opened(collection_id)
     everything = request.query_params.multi_items()
-    query = _query(run, layer, asked, [(name, value) for name, value in everything if name not in _NAMES])
-    page = feature_page(run, layer, query)
-    place = f"{base}/collections/{run.run.collection_id(layer.table)}"
+    search = _search(run, table, asked, [(name, value) for name, value in everything if name not in _NAMES])
+    run.crs.named(asked.crs, "crs")
+    positions, following = search.page(asked.limit, asked.start)
+    place = f"{base}/collections/{run.collection_id(table)}"
 
     def at(given: Sequence[tuple[str, str]]) -> str:
         return f"{place}/items?{urlencode(given)}" if given else f"{place}/items"
 
     links = [link(at(everything), "self", "These features", GEOJSON), link(place, "collection", "The collection")]
-    if page.following is not None:
+    if following is not None:
         again = [(name, value) for name, value in everything if name not in {"start", "limit"}]
-        again += [("limit", str(asked.limit)), ("start", str(page.following))]
+        again += [("limit", str(asked.limit)), ("start", str(following))]
         links.append(link(at(again), "next", "The next features", GEOJSON))
-    members: dict[str, Any] = {"type": "FeatureCollection", "timeStamp": timestamp(dt.datetime.now(dt.UTC))}
-    if page.matched is not None:
-        members["numberMatched"] = page.matched
-    members |= {"numberReturned": len(page.features), "links": [one.model_dump() for one in links]}
-    body = b"".join(_collected(members, page.features))
-    return Response(body, media_type=GEOJSON, headers=_headers(query.crs.uri))
-
-
-def _collected(members: Mapping[str, Any], features: Sequence[bytes]) -> Iterator[bytes]:
-    yield json.dumps(members, ensure_ascii=False).encode()[:-1] + b',"features":[\n'
-    yield b",\n".join(features)
-    yield b"\n]}\n"
+    matched = search.matched()
+    members: dict[str, Any] = {
+        "timeStamp": timestamp(dt.datetime.now(dt.UTC)),
+        **({} if matched is None else {"numberMatched": matched}),
+        "numberReturned": len(positions),
+        "links": [one.model_dump() for one in links],
+    }
+    texts, uri = _texts(run, table, positions, asked.crs)
+    return Response(b"".join(collected(members, texts)), media_type=GEOJSON, headers=_headers(uri))
 
 
 def _headers(crs: str) -> dict[str, str]:
@@ -487,7 +470,7 @@ def _headers(crs: str) -> dict[str, str]:
     responses={
         200: {
             "description": "The feature.",
-            "content": {GEOJSON: {"schema": reference(CollectionFeature), "example": _FEATURE_EXAMPLE}},
+            "content": {GEOJSON: {"schema": reference(CollectionFeature), "example": FEATURE_EXAMPLE}},
             "headers": _CRS_HEADER,
         },
         **problems(404, 406),
@@ -502,19 +485,22 @@ def item(
     crs: _Crs = None,
 ) -> Response:
     """One feature by its id."""
-    from service.features.pages import single_feature
-
     preferred(request.headers.get("accept"), [GEOJSON])
-    run, layer = _opened(runs, collection_id)
-    named = run.crs.named(crs, "crs")
-    text = single_feature(run, layer, feature_id, named)
-    place = f"{base}/collections/{run.run.collection_id(layer.table)}"
+    run, table = runs.opened(collection_id)
+    with run.index.opened() as connection:
+        query = f"SELECT position FROM {table} WHERE id = ?"  # noqa: S608 - our own words
+        row = connection.execute(query, (feature_id,)).fetchone()
+    if row is None:
+        raise NoSuchFeatureError(f"{collection_id} holds no feature {feature_id[:80]!r}")
+    texts, uri = _texts(run, table, row, crs)
+    (text,) = texts
+    place = f"{base}/collections/{collection_id}"
     links = [
         link(f"{place}/items/{feature_id}", "self", "This feature", GEOJSON),
         link(place, "collection", "The collection"),
     ]
-    if run.run.is_job and layer.table == "buildings" and "." not in run.run.name:
-        building = f"{base}/jobs/{run.run.name}/buildings/{feature_id}"
+    if run.is_job and table == "buildings" and "." not in run.name:
+        building = f"{base}/jobs/{run.name}/buildings/{feature_id}"
         links.append(link(building, "related", "The building with its planes and models", GEOJSON))
     body = text[:-1] + b',"links":' + json.dumps([one.model_dump() for one in links]).encode() + b"}"
-    return Response(body, media_type=GEOJSON, headers=_headers(named.uri))
+    return Response(body, media_type=GEOJSON, headers=_headers(uri))

@@ -18,13 +18,16 @@ from fastapi import Depends, Query
 from pipeline.model import Status
 from service.disk import Disk
 from service.errors import NoSuchOutputError, RequestError, ResultNotReadyError, StoreError
+from service.features.index import NAME as INDEX_NAME
+from service.features.index import RowIndex
+from service.features.runs import job_index
 from service.files import StateFolder
 from service.jobs import Job, JobStatus
 from service.outputs import Catalogue, read_catalogue, run_outputs
 from service.outputs.catalogue import NOTHING_YET
 from service.outputs.comparison import RUNS
-from service.outputs.kinds import OUTPUTS
-from service.outputs.selected import OFFERED, Selections, refuse_others
+from service.outputs.kinds import SELECTABLE
+from service.outputs.selected import Selections, refuse_others
 from service.problems import JobFailedError
 from service.routes.bound import Folder, Reader, Selecting, Store
 from service.routes.jobs import JobId
@@ -58,6 +61,12 @@ class FinishedJob:
     def has_buildings_yet(self) -> bool:
         """Whether there is an index of buildings."""
         return self.catalogue is not NOTHING_YET
+
+    @property
+    def index(self) -> RowIndex:
+        """The rows of its tables."""
+        path = self.out_dir / INDEX_NAME
+        return job_index(path, self.run_dir) if self.is_complete else RowIndex(path)
 
     def run(self, label: str) -> FinishedJob:
         """One run of a comparison, as if it were a job of its own."""
@@ -146,7 +155,7 @@ _Only = Annotated[
     Query(
         alias="status",
         description=f"Only buildings of these statuses: {', '.join(Status)}; with commas, or the parameter again. For "
-        f"{', '.join(name for name in OUTPUTS if name in OFFERED)}. These outputs are made when they are first asked "
+        f"{', '.join(SELECTABLE)}. These outputs are made when they are first asked "
         "for; until then the answer is 503 with Retry-After.",
         examples=["ok"],
     ),

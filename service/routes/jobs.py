@@ -13,6 +13,7 @@ from fastapi import APIRouter, Body, Path, Query, Response
 from pydantic import ValidationError
 from starlette.concurrency import run_in_threadpool
 
+from pipeline.options import served
 from service import bodies
 from service.errors import JobNotOverError, RequestError
 from service.files import StateFolder
@@ -151,7 +152,9 @@ def _words(text: str) -> list[str]:
     return found
 
 
-_AS_JSON = frozenset({"settings", "subscriber", "bbox", "priority", "allowOutsideAreaOfUse", "points", "geoidHeight"})
+_AS_JSON = frozenset(
+    {"settings", "subscriber", "priority", "geoidHeight", *(one.input for one in served() if one.type is not str)}
+)
 
 
 async def _value(name: str, text: str, max_bytes: int, faults: list[str]) -> Any:

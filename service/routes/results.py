@@ -116,7 +116,7 @@ def file_answers(documents: Mapping[str, bool], **described: str) -> dict[int | 
     summary="One output as a file",
     response_class=Response,
     responses=file_answers(
-        {kind.media_type: kind.schema["type"] == "object" for kind in KINDS.values()},
+        {kind.media_type: kind.is_document for kind in KINDS.values()},
         ETag="The sha256.",
         Content_Disposition="A name to save it under.",
     ),

@@ -230,7 +230,7 @@ def webhook(webhook_id: WebhookId, base: Base, store: Store, _caller: Admin) -> 
 async def replay_webhook(webhook_id: WebhookId, base: Base, store: Store, write: Write, _caller: Admin) -> Response:
     """Send all that waits for a webhook, and the ends of jobs that failed or were dropped.
 
-    This ends its pause, and enables it if its receiver had answered 410.
+    This enables it, too, if its receiver had answered 410.
     """
     found = await write(lambda: store.webhooks.replay_all(webhook_id))
     return respond(wire.Webhook(**_members(found, base)), status_code=202)
@@ -264,8 +264,6 @@ def _members(found: records.Endpoint, base: str) -> dict[str, Any]:
         "disabledReason": found.disabled_reason,
         "created": found.created_at,
         "updated": found.updated_at,
-        "pausedSince": found.paused_at,
-        "notSent": found.not_sent or None,
         "links": [
             link(place, "self", "This webhook"),
             link(f"{base}/webhooks/deliveries?webhook={found.endpoint_id}", "deliveries", "What was sent"),

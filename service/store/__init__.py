@@ -3,7 +3,7 @@
 from service.store.deadline import RequestDeadline
 from service.store.job_store import JobStore
 from service.store.queries import JobFilter
-from service.store.schedules import ScheduleFilter
-from service.store.webhook_deliveries import DeliveryFilter
+from service.store.schedule_store import ScheduleFilter
+from service.store.webhook_store import DeliveryFilter
 
 __all__ = ["DeliveryFilter", "JobFilter", "JobStore", "RequestDeadline", "ScheduleFilter"]

@@ -222,7 +222,7 @@ class Database:
                         keep_private(beside)
         # another process may be migrating: that takes as long as it takes
         with self.write(wait_s=WAIT_S) as connection:
-            self.lock(connection, _LOCK_MIGRATIONS)
+            lock(connection, _LOCK_MIGRATIONS)
             found = migrations.current(connection)
             self._check_not_newer(found)
             if found != migrations.head():
@@ -249,11 +249,6 @@ class Database:
                 f"{self.public_name} has the tables of revision {found or 'none'}, this version needs "
                 f"{migrations.head()}: start the service or a driver once, they migrate it"
             )
-
-    def lock(self, connection: Connection, number: int) -> None:
-        """Hold a lock until the transaction ends; a writer of SQLite is alone anyway."""
-        if not self.is_sqlite:
-            connection.execute(sa.select(sa.func.pg_advisory_xact_lock(number)))
 
     def now(self, connection: Connection) -> dt.datetime:
         """The database's clock, in UTC; to the millisecond on SQLite.
@@ -316,6 +311,25 @@ class Database:
         if passes or isinstance(error, exc.OperationalError | exc.InterfaceError):
             return StoreError(f"{self.public_name} does not answer: {cause}")
         return None
+
+
+class StorePart:
+    """A part of the store: each method is a transaction, and may raise `StoreError` if the database does not answer.
+
+    Parameters
+    ----------
+    database : Database
+        The store's own.
+    """
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+
+def lock(connection: Connection, number: int) -> None:
+    """Hold a lock until the transaction ends; a writer of SQLite is alone anyway."""
+    if connection.dialect.name != "sqlite":
+        connection.execute(sa.select(sa.func.pg_advisory_xact_lock(number)))
 
 
 def after_commit(connection: Connection, action: Callable[[], None]) -> None:

@@ -9,16 +9,14 @@ from typing import Any
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
-from service.files import is_id
-from service.jobs import LogLevel, LogLine, NewLogLine
-from service.store.records import log_line_of, storable
+from service.jobs import NewLogLine
+from service.store.records import storable
 from service.store.tables import JOBS, LOG_LINES
 
 MAX_LINES = 2000
 """Lines kept per job: the newest."""
 MAX_LETTERS = 1000
 """Letters of a line's message, and of each of its facts; the rest is cut off."""
-_LAST = 2**31 - 1
 
 
 def append(
@@ -48,36 +46,6 @@ def append(
     if last > MAX_LINES:
         old = sa.and_(LOG_LINES.c.job_id == row.job_id, LOG_LINES.c.number <= last - MAX_LINES)
         connection.execute(sa.delete(LOG_LINES).where(old))
-
-
-def listed(
-    connection: Connection, job_id: str, *, after: int, before: int | None, level: LogLevel, limit: int
-) -> list[LogLine]:
-    """Lines of a job in their order.
-
-    Parameters
-    ----------
-    after : int
-        Only lines with a higher number; 0 for all.
-    before : int, optional
-        Only lines with a lower number.
-    level : LogLevel
-        Only lines that are as serious as this one, or more.
-    limit : int
-        Maximum number of lines: the newest ones, unless `after` is given, then the first ones after it.
-    """
-    if not is_id(job_id):
-        return []
-    levels = list(LogLevel)
-    wanted = [LOG_LINES.c.job_id == job_id, LOG_LINES.c.level.in_([w.value for w in levels[levels.index(level) :]])]
-    if after:
-        wanted.append(LOG_LINES.c.number > min(after, _LAST))
-    if before is not None:
-        wanted.append(LOG_LINES.c.number < min(before, _LAST))
-    order = LOG_LINES.c.number.asc() if after else LOG_LINES.c.number.desc()
-    chosen = sa.select(LOG_LINES).where(*wanted).order_by(order).limit(limit)
-    found = [log_line_of(row) for row in connection.execute(chosen)]
-    return found if after else found[::-1]
 
 
 def _cut(text: str) -> str:

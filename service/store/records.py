@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import sqlalchemy as sa
 
 from service.jobs import Fault, Job, JobEvent, JobFailure, JobRequest, JobStatus, LogLevel, LogLine, Upload
 from service.keys import Key, Scope
+from service.webhooks import Delivery, DeliveryState, Endpoint, EventType
 
 
 def storable(text: str, limit: int | None = None) -> str:
@@ -88,3 +90,15 @@ def upload_of(row: sa.Row[Any]) -> Upload:
 def key_of(row: sa.Row[Any]) -> Key:
     """A row of `keys`."""
     return Key(**row._asdict() | {"scopes": frozenset(Scope(scope) for scope in row.scopes)})
+
+
+def endpoint_of(row: sa.Row[Any]) -> Endpoint:
+    """A row of `webhooks`."""
+    values = {field.name: getattr(row, field.name) for field in dataclasses.fields(Endpoint)}
+    return Endpoint(**values | {"events": tuple(EventType(word) for word in row.events)})
+
+
+def delivery_of(row: sa.Row[Any]) -> Delivery:
+    """A row of `webhook_deliveries`, without the log of its attempts."""
+    values = {field.name: getattr(row, field.name) for field in dataclasses.fields(Delivery) if field.name != "log"}
+    return Delivery(**values | {"event": EventType(row.event), "state": DeliveryState(row.state)})

@@ -261,27 +261,16 @@ WEBHOOKS = sa.Table(
     sa.Column("created_at", UtcTime, nullable=False),
     sa.Column("updated_at", UtcTime, nullable=False),
     sa.Column("secret", sa.String(64), nullable=False),
-    sa.Column("old_secret", sa.String(64)),
-    sa.Column("old_until", UtcTime),
     sa.Column("changed_at", UtcTime, nullable=False),
     sa.Column("owner", sa.String(64)),
-    sa.Column("sent_until", UtcTime),
-    sa.Column("is_behind", sa.Boolean, nullable=False, server_default=sa.false()),
-    sa.Column("paused_at", UtcTime),
 )
-"""One row per endpoint that gets the events of all jobs. Secrets are stored, since they sign.
-
-Up to `sent_until` each event that it wants has its delivery. Where it `is_behind`, later events wait in
-`webhook_events` for room, in their order.
-"""
+"""One row per endpoint that gets the events of all jobs. Secrets are stored, since they sign."""
 
 WEBHOOK_SECRETS = sa.Table(
     "webhook_secrets",
     METADATA,
     sa.Column("owner", sa.String(64), primary_key=True),
     sa.Column("secret", sa.String(64), nullable=False),
-    sa.Column("old_secret", sa.String(64)),
-    sa.Column("old_until", UtcTime),
     sa.Column("changed_at", UtcTime, nullable=False),
 )
 """One row per key whose subscribers get signed messages; the owner is empty if keys are not used."""
@@ -296,7 +285,6 @@ WEBHOOK_DELIVERIES = sa.Table(
     sa.Column("url", sa.Text, nullable=False),
     sa.Column("base", sa.Text, nullable=False),
     sa.Column("event", sa.String(32), nullable=False),
-    sa.Column("snapshot", sa.JSON, nullable=False),
     sa.Column("body", sa.Text),
     sa.Column("state", sa.String(16), nullable=False),
     sa.Column("reason", sa.Text),
@@ -308,13 +296,8 @@ WEBHOOK_DELIVERIES = sa.Table(
     sa.Column("lease_owner", sa.String(255)),
     sa.Column("lease_until", UtcTime),
     sa.Column("event_id", sa.String(32)),
-    sa.Column("replay_at", UtcTime),
 )
-"""One row per message and receiver: the outbox, and later the log. Not tied to jobs, which may be removed before.
-
-The job as it was is in the event; `snapshot` has it for deliveries that were made before there were events. One that
-has `replay_at` waits for room to be sent again.
-"""
+"""One row per message and receiver: the outbox, and later the log. Not tied to jobs, which may be removed before."""
 
 sa.Index("webhook_deliveries_in_line", WEBHOOK_DELIVERIES.c.state, WEBHOOK_DELIVERIES.c.due_at)
 sa.Index("webhook_deliveries_by_lease", WEBHOOK_DELIVERIES.c.lease_until)
@@ -325,7 +308,6 @@ sa.Index("webhook_deliveries_by_owner", WEBHOOK_DELIVERIES.c.owner, WEBHOOK_DELI
 sa.Index("webhook_deliveries_by_end", WEBHOOK_DELIVERIES.c.finished_at)
 sa.Index("webhook_deliveries_by_room", WEBHOOK_DELIVERIES.c.state, WEBHOOK_DELIVERIES.c.endpoint_id)
 sa.Index("webhook_deliveries_by_event", WEBHOOK_DELIVERIES.c.event_id, WEBHOOK_DELIVERIES.c.endpoint_id, unique=True)
-sa.Index("webhook_deliveries_by_replay", WEBHOOK_DELIVERIES.c.replay_at, WEBHOOK_DELIVERIES.c.endpoint_id)
 
 WEBHOOK_EVENTS = sa.Table(
     "webhook_events",
@@ -336,13 +318,8 @@ WEBHOOK_EVENTS = sa.Table(
     sa.Column("event", sa.String(32), nullable=False),
     sa.Column("at", UtcTime, nullable=False),
     sa.Column("snapshot", sa.JSON, nullable=False),
-    sa.Column("base", sa.Text),
-    sa.Column("body", sa.Text),
 )
-"""One row per event of a job that a receiver wants, however many they are.
-
-`body` is what was sent to endpoints with this `base`.
-"""
+"""One row per event of a job that a receiver wants, however many they are; it has the job as it was."""
 
 sa.Index("webhook_events_by_age", WEBHOOK_EVENTS.c.at, WEBHOOK_EVENTS.c.event_id)
 sa.Index("webhook_events_by_job", WEBHOOK_EVENTS.c.job_id, WEBHOOK_EVENTS.c.event, WEBHOOK_EVENTS.c.at)

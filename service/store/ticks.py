@@ -6,9 +6,7 @@ the same slot, and one that dies midway leaves everything as it was.
 
 from __future__ import annotations
 
-import dataclasses
 import datetime as dt
-from collections.abc import Callable
 
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
@@ -20,23 +18,11 @@ from service.schedules import Schedule, ScheduleRun, Trigger
 from service.store import schedules
 from service.store.records import key_of
 from service.store.slot_book import SlotBook
-from service.store.submissions import check_queue, insert
+from service.store.submissions import QueueLimits, check_queue, insert
 from service.store.tables import KEYS, SCHEDULES
 
 BROKEN_PAUSE = dt.timedelta(hours=1)
 """Time after which a schedule that this machine cannot read is tried again."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class QueueLimits:
-    """How many jobs may wait, and the lock under which they are counted."""
-
-    max_queued: int
-    """All jobs."""
-    max_queued_per_key: int
-    """Jobs of one key."""
-    lock: Callable[[Connection], None]
-    """Keeps others from making jobs until the transaction ends."""
 
 
 def something_is_due(connection: Connection, now: dt.datetime) -> bool:
@@ -86,7 +72,7 @@ def run_by_hand(
     QueueFullError
         Too many jobs wait.
     """
-    row = schedules.lock(connection, schedule_id, owner)
+    row = schedules.row_of(connection, schedule_id, owner, locked=True)
     book = SlotBook(connection, row)
     if book.busy_with is not None:
         raise ScheduleBusyError(f"{book.under_way} is under way: wait until it is over, or dismiss it", book.busy_with)
@@ -127,8 +113,7 @@ def _submit(connection: Connection, schedule: Schedule, now: dt.datetime, limits
                 f"the key {key.name!r} that made this schedule {fault}: make the schedule again with another key, or "
                 "rotate this one if it expired"
             )
-    limits.lock(connection)
-    check_queue(connection, owner, max_queued=limits.max_queued, max_queued_per_key=limits.max_queued_per_key)
+    check_queue(connection, owner, limits)
     definition = schedule.definition
     return insert(
         connection,

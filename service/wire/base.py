@@ -72,18 +72,26 @@ def link(href: str, rel: str, title: str, media_type: str = "application/json") 
     return Link(href=href, rel=rel, type=media_type, title=title)
 
 
-def page_links(place: str, given: Sequence[tuple[str, object]], found: int, limit: int, offset: int) -> list[Link]:
+def page_links(
+    place: str,
+    given: Sequence[tuple[str, object]],
+    found: int,
+    limit: int,
+    offset: int,
+    media_type: str = "application/json",
+) -> list[Link]:
     """Links from a page of a list to itself and its neighbours; `found` may be `limit` + 1."""
     query = [(name, value) for name, value in given if value is not None]
 
-    def page(start: int) -> str:
-        return f"{place}?{urlencode([*query, ('limit', limit), ('offset', start)], errors='replace')}"
+    def page(start: int, rel: str, title: str) -> Link:
+        asked = urlencode([*query, ("limit", limit), ("offset", start)], errors="replace")
+        return link(f"{place}?{asked}", rel, title, media_type)
 
-    links = [link(page(offset), "self", "This page")]
+    links = [page(offset, "self", "This page")]
     if found > limit:
-        links.append(link(page(offset + limit), "next", "The next page"))
+        links.append(page(offset + limit, "next", "The next page"))
     if offset > 0:
-        links.append(link(page(max(0, offset - limit)), "prev", "The page before"))
+        links.append(page(max(0, offset - limit), "prev", "The page before"))
     return links
 
 

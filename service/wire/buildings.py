@@ -8,14 +8,7 @@ from pydantic import Field
 
 from service.outputs.single_building import ID_PATTERN
 from service.wire.base import Answer, Link
-
-
-class Outline(Answer):
-    """A footprint."""
-
-    type: Literal["Polygon", "MultiPolygon"]
-    coordinates: list[Any]
-
+from service.wire.features import Shape
 
 _VERTICAL_UNIT = Field(None, description="Metres per unit of the properties that are elevations, such as `ridge_z`.")
 
@@ -25,7 +18,7 @@ class Feature(Answer):
 
     type: Literal["Feature"]
     id: str = Field(pattern=ID_PATTERN)
-    geometry: Outline | None
+    geometry: Shape | None
     properties: dict[str, Any] = Field(description="The columns of the table buildings, and `tile`.")
     verticalUnitM: float | None = _VERTICAL_UNIT
     links: list[Link] | None = None

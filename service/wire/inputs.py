@@ -5,14 +5,23 @@ from __future__ import annotations
 import dataclasses
 import importlib.util
 import unicodedata
-from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar, Literal, get_args
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any, ClassVar, TypeVar
 
-from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, WithJsonSchema, field_validator
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Field,
+    ValidationInfo,
+    WithJsonSchema,
+    create_model,
+    field_validator,
+)
 
 from pipeline.errors import CrsError
 from pipeline.io.crs import LARGEST_COORDINATE, horizontal_unit_of
 from pipeline.io.crs_given import UNITS_M, with_authority
+from pipeline.options import Option, chosen_settings, served
 from service.drafts import Draft, Inline
 from service.errors import RequestError, within
 from service.input_policy import checked_crs
@@ -80,10 +89,10 @@ def _same_crs(one: str, other: str) -> bool:
         return False
 
 
-def _has_area(box: list[float]) -> list[float]:
+def _has_area(box: list[float]) -> tuple[float, ...]:
     if len(box) != 4 or not (box[0] < box[2] and box[1] < box[3]):
         raise ValueError("use x_min, y_min, x_max, y_max with a positive width and depth")
-    return box
+    return tuple(map(float, box))
 
 
 _FOUR_NUMBERS = {"type": "array", "items": {"type": "number"}, "minItems": 4, "maxItems": 4}
@@ -111,23 +120,6 @@ Box = Annotated[
 RunSettings = Annotated[dict[str, Any], WithJsonSchema(settings_schema())]
 """Tables of settings."""
 
-Meshes = Literal["building", "tile", "glb", "none"]
-
-
-def _word(name: str, title: str, description: str) -> Any:
-    """A general setting as a separate input; if absent, it comes from `settings` or is the default."""
-    return Field(None, title=title, description=description, json_schema_extra={"default": getattr(DEFAULTS, name)})
-
-
-def _settings() -> Any:
-    return Field(
-        default_factory=dict,
-        title="Settings",
-        description="The settings that differ from the defaults, as the tables of a settings file.",
-        validate_default=True,
-    )
-
-
 _LISTS = ("tiles", "methods")
 """Inputs that are missing if they are empty."""
 
@@ -140,9 +132,9 @@ def _unwrapped(name: str, value: Any) -> Any:
     return value
 
 
-def _completed(settings: dict[str, Any], info: ValidationInfo, *names: str) -> dict[str, Any]:
+def _completed(settings: dict[str, Any], info: ValidationInfo) -> dict[str, Any]:
     """Settings with the general ones that are inputs of their own; raises all their faults and contradictions."""
-    given = {name: info.data[name] for name in names if info.data.get(name) is not None}
+    given = chosen_settings(info.data)
     faults = [
         f"{name} is {word} and settings.{name} is {shortened(settings[name])}: give one of them"
         for name, word in given.items()
@@ -183,8 +175,52 @@ class JobInputs(Request):
         return Draft(tiles=(), footprints=None, priority=self.priority, values=values)
 
     def of_process(self) -> dict[str, Any]:
-        """The fields of a `JobRequest` that differ between processes."""
-        raise NotImplementedError
+        """Further fields of a `JobRequest` that this process has."""
+        return {}
+
+
+TYPES: Mapping[str, Any] = {
+    "footprints_layer": Text,
+    "crs": Crs,
+    "vertical_unit": Annotated[str, OneOf(*UNITS_M)],
+    "bbox": Box,
+    "licence": Text,
+}
+"""Types of options that check more than their own type and words."""
+
+
+def type_of(option: Option) -> Any:
+    """The type of an option as an input."""
+    choices = option.meta["choices"]
+    return TYPES.get(option.name) or (Annotated[str, OneOf(*choices)] if choices else option.type)
+
+
+Model = TypeVar("Model", bound=JobInputs)
+
+
+def _with_options(process_id: str) -> Callable[[type[Model]], type[Model]]:
+    """Add the options that a process takes, then the settings, which are checked with them."""
+
+    def extended(model: type[Model]) -> type[Model]:
+        fields: dict[str, Any] = {}
+        for one in served(process_id):
+            meta, kind = one.meta, type_of(one)
+            # a setting that is absent comes from `settings` or is the default
+            shown = {"default": getattr(DEFAULTS, one.name)} if one.is_setting else None
+            described = Field(one.default, title=meta["label"], description=meta["doc"], json_schema_extra=shown)
+            fields[one.input] = (kind if one.default is not None else kind | None, described)
+        fields["settings"] = (
+            RunSettings,
+            Field(
+                default_factory=dict,
+                title="Settings",
+                description="The settings that differ from the defaults, as the tables of a settings file.",
+                validate_default=True,
+            ),
+        )
+        return create_model(model.__name__, __base__=model, __doc__=model.__doc__, **fields)
+
+    return extended
 
 
 class EchoInputs(JobInputs):
@@ -205,7 +241,7 @@ class EchoInputs(JobInputs):
 
 
 class Inputs(JobInputs):
-    """The inputs of processes that read tiles. `settings` comes last in a subclass: it needs the others."""
+    """The inputs of processes that read tiles: files here, options and settings by `_with_options`."""
 
     HINTS: ClassVar[Mapping[str, str]] = {"tiles": "give one point cloud or more"}
 
@@ -216,34 +252,18 @@ class Inputs(JobInputs):
         description="Building outlines to be modelled, as GeoJSON, GeoPackage, GeoParquet, FlatGeobuf, GML, KML or a "
         f"zip archive with one of them or a Shapefile. {GIVEN_BY}",
     )
-    footprintsLayer: Text | None = Field(
-        None, title="Layer of the footprints", description="The layer to use, where the file of footprints has several."
-    )
-    crs: Crs | None = Field(
-        None,
-        title="CRS",
-        description="Coordinate reference system of the tiles, if their header has none or a wrong one: EPSG code or "
-        "WKT.",
-        examples=["EPSG:28992"],
-    )
-    verticalUnit: Annotated[str, OneOf(*UNITS_M)] | None = Field(
-        None, title="Vertical unit", description="Unit of elevations, if the header has none or a wrong one."
-    )
-    allowOutsideAreaOfUse: bool = Field(
-        False,
-        title="Allow places outside the area of use",
-        description="Accept tiles that lie far outside the area of use of their CRS, which mostly means a wrong CRS.",
-    )
-    classes: Annotated[str, OneOf(*choices("classes"))] | None = _word(
-        "classes", "Classes", "How far the file's own classes are trusted."
-    )
 
-    @field_validator("footprintsLayer")
+    @field_validator("footprintsLayer", check_fields=False)
     @classmethod
     def _of_footprints(cls, layer: str | None, info: ValidationInfo) -> str | None:
         if layer is not None and info.data.get("footprints", layer) is None:
             raise ValueError("it is a layer of footprints, and none are given: give footprints, or leave it out")
         return layer
+
+    @field_validator("settings", check_fields=False)
+    @classmethod
+    def _complete(cls, settings: dict[str, Any], info: ValidationInfo) -> dict[str, Any]:
+        return _completed(settings, info)
 
     def draft(self, process_id: str, outputs: tuple[str, ...] | None) -> Draft:
         """The draft of a job; outputs are None for all."""
@@ -253,12 +273,9 @@ class Inputs(JobInputs):
             else tile
             for n, tile in enumerate(self.tiles)
         )
-        values = {
-            "footprints_layer": self.footprintsLayer,
-            "crs": self.crs,
-            "vertical_unit": self.verticalUnit,
-            "allow_outside_area_of_use": self.allowOutsideAreaOfUse,
-        }
+        given = dict(self)
+        values = {one.name: given[one.input] for one in served(process_id) if not one.is_setting}
+        values["settings"] = given["settings"]
         plain = super().draft(process_id, outputs)
         return dataclasses.replace(plain, tiles=tiles, footprints=self.footprints, values={**values, **plain.values})
 
@@ -272,28 +289,10 @@ class BuildingInputs(Inputs):
         description="Lines of roofs that models follow, such as ridges and eaves, as GeoJSON, GeoPackage or "
         f"GeoParquet; their column kind says what they are. {GIVEN_BY}",
     )
-    bbox: Box | None = Field(
-        None,
-        title="Rectangle",
-        description="Only this rectangle: x_min, y_min, x_max, y_max in the tiles' CRS and its units.",
-    )
-    meshes: Meshes = Field(
-        get_args(Meshes)[0],
-        title="Meshes",
-        description="One OBJ file per building (building) or per tile (tile), one GLB file per tile (glb), or none.",
-    )
-    licence: Text | None = Field(
-        None, title="Licence", description="Licence of the source data; goes into the results."
-    )
 
     def draft(self, process_id: str, outputs: tuple[str, ...] | None) -> Draft:
         """The draft of a job; outputs are None for all."""
         return dataclasses.replace(super().draft(process_id, outputs), guides=self.guides)
-
-    def of_process(self) -> dict[str, Any]:
-        """Rectangle, meshes and licence."""
-        bbox = None if self.bbox is None else tuple(map(float, self.bbox))
-        return {"bbox": bbox, "meshes": self.meshes, "licence": self.licence}
 
 
 def _as_list(given: Any) -> Any:
@@ -307,28 +306,10 @@ def _makeable(formats: list[str]) -> list[str]:
     return list(dict.fromkeys(formats))
 
 
+@_with_options("reconstruct")
 class ReconstructInputs(BuildingInputs):
     """The inputs of `reconstruct`."""
 
-    method: Annotated[str, OneOf(*choices("method"))] | None = _word(
-        "method", "Method", "The method that models the buildings."
-    )
-    preset: Annotated[str, OneOf(*choices("preset"))] | None = _word(
-        "preset",
-        "Preset",
-        "Starting point of the method's settings: those that measured better (robust), or those of its paper "
-        "(faithful).",
-    )
-    lods: Annotated[str, OneOf(*choices("lods"))] | None = _word(
-        "lods",
-        "Levels of detail",
-        "LoD1.2 (blocks), LoD1.3 (level parts), LoD2.2 (roof faces), or several; records describe the finest.",
-    )
-    points: bool = Field(
-        False,
-        title="Points",
-        description="Also deliver the points as 3D Tiles, with their classes and their distances to the models.",
-    )
     publish: Annotated[
         list[Annotated[str, OneOf(*FORMATS)]], BeforeValidator(_as_list), AfterValidator(_makeable), at_most(100)
     ] = Field(
@@ -347,12 +328,6 @@ class ReconstructInputs(BuildingInputs):
         description="Metres of the geoid above the ellipsoid of WGS 84, added to the elevations of 3D Tiles. Default: "
         "by PROJ, if it has the grid, else nothing.",
     )
-    settings: RunSettings = _settings()
-
-    @field_validator("settings")
-    @classmethod
-    def _complete(cls, settings: dict[str, Any], info: ValidationInfo) -> dict[str, Any]:
-        return _completed(settings, info, "method", "preset", "lods", "classes")
 
     def draft(self, process_id: str, outputs: tuple[str, ...] | None) -> Draft:
         """The draft of a job; outputs are None for all. A format is made if its output is named, and the reverse."""
@@ -364,10 +339,6 @@ class ReconstructInputs(BuildingInputs):
         plain = super().draft(process_id, outputs)
         values = {"publish": tuple(form for form in FORMATS if form in asked), "geoid_height": self.geoidHeight}
         return dataclasses.replace(plain, values={**plain.values, **values})
-
-    def of_process(self) -> dict[str, Any]:
-        """Points and settings, too."""
-        return super().of_process() | {"points": self.points, "settings": self.settings}
 
 
 Variant = Annotated[str, OneOf(*VARIANTS)]
@@ -383,6 +354,7 @@ def _distinct(words: list[str]) -> list[str]:
     return found
 
 
+@_with_options("compare")
 class CompareInputs(BuildingInputs):
     """The inputs of `compare`."""
 
@@ -401,9 +373,8 @@ class CompareInputs(BuildingInputs):
         "robust.",
         json_schema_extra={"uniqueItems": True},
     )
-    settings: RunSettings = _settings()
 
-    @field_validator("settings")
+    @field_validator("settings", check_fields=False)
     @classmethod
     def _complete(cls, settings: dict[str, Any], info: ValidationInfo) -> dict[str, Any]:
         faults = [
@@ -418,7 +389,7 @@ class CompareInputs(BuildingInputs):
             if name in settings and compared and name not in compared
         ]
         try:
-            completed = _completed(settings, info, "classes")
+            completed = _completed(settings, info)
         except FaultsError as error:
             faults += error.faults
         if faults:
@@ -426,10 +397,11 @@ class CompareInputs(BuildingInputs):
         return completed
 
     def of_process(self) -> dict[str, Any]:
-        """Settings and methods, too."""
-        return super().of_process() | {"settings": self.settings, "methods": tuple(self.methods)}
+        """The methods."""
+        return {"methods": tuple(self.methods)}
 
 
+@_with_options("classify")
 class ClassifyInputs(Inputs):
     """The inputs of `classify`."""
 
@@ -441,13 +413,7 @@ class ClassifyInputs(Inputs):
         title="Cell of the rasters",
         description="Side of the rasters' cells in units of the tiles' CRS; default half a metre or two feet.",
     )
-    settings: RunSettings = _settings()
-
-    @field_validator("settings")
-    @classmethod
-    def _complete(cls, settings: dict[str, Any], info: ValidationInfo) -> dict[str, Any]:
-        return _completed(settings, info, "classes")
 
     def of_process(self) -> dict[str, Any]:
-        """Settings and cell."""
-        return {"settings": self.settings, "raster_cell": self.rasterCell}
+        """The cell."""
+        return {"raster_cell": self.rasterCell}

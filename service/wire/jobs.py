@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import ConfigDict, Field, WithJsonSchema
+from pydantic import ConfigDict, Field, WithJsonSchema, create_model
 
-from pipeline.io.crs_given import UNITS_M
+from pipeline.options import Option, served
 from service.outputs.kinds import FORMATS
-from service.run_settings import VARIANTS, choices
+from service.run_settings import VARIANTS
 from service.wire import patterns
 from service.wire.base import Answer, Link, OneOf, Request, Time
 from service.wire.execute import Execute
-from service.wire.inputs import Meshes, Text
+from service.wire.inputs import Text, type_of
 from service.wire.problems import Problem
 from service.wire.queries import entry_of
 
@@ -113,7 +113,7 @@ class ServerSentEvent(Answer):
 File = Annotated[bytes, WithJsonSchema({"type": "string", "format": "binary"})]
 
 
-class JobForm(Answer):
+class FormOfFiles(Answer):
     """Fields of the form. They become the inputs of a process."""
 
     model_config = ConfigDict(extra="forbid")
@@ -122,40 +122,40 @@ class JobForm(Answer):
         list[File], Field(min_length=1, description="Point clouds. A field without a file name contains an href.")
     ]
     footprints: File | None = Field(None, description="Building outlines, as a file or an href.")
-    footprintsLayer: str | None = Field(None, description="Layer of the outlines, where their file has several.")
     guides: File | None = Field(None, description="Lines of roofs, as a file or an href.")
-    crs: str | None = None
-    verticalUnit: Annotated[str, OneOf(*UNITS_M)] | None = None
-    allowOutsideAreaOfUse: bool | None = None
-    bbox: str | None = Field(
-        None,
-        description="x_min,y_min,x_max,y_max in the tiles' CRS.",
-        json_schema_extra=patterns.stated(patterns.WINDOW),
-    )
-    method: Annotated[str, OneOf(*choices("method"))] | None = None
-    preset: Annotated[str, OneOf(*choices("preset"))] | None = Field(
-        None, description="Starting point of the method's settings."
-    )
-    lods: Annotated[str, OneOf(*choices("lods"))] | None = Field(
-        None, description="Levels of detail with commas between them: 1.2, 1.3, 2.2, 2.3."
-    )
     methods: list[Annotated[str, entry_of(VARIANTS)]] | None = Field(
         None,
         description="Makes the job a comparison of these, each METHOD or METHOD:PRESET, instead of method and preset: "
         "the field several times, or with commas.",
     )
-    classes: Annotated[str, OneOf(*choices("classes"))] | None = None
     settings: str | None = Field(None, description="JSON.")
-    meshes: Meshes | None = None
-    points: bool | None = Field(None, description="Whether to deliver the points, too, as 3D Tiles.")
     publish: list[Annotated[str, entry_of(FORMATS)]] | None = Field(
         None, description="Further formats of the models: the field several times, or with commas."
     )
     geoidHeight: float | None = Field(
         None, ge=-200.0, le=200.0, description="Metres of the geoid above the ellipsoid, for 3D Tiles."
     )
-    licence: Text | None = None
     title: Text | None = None
     priority: int | None = Field(None, ge=-10, le=10)
     subscriber: str | None = Field(None, description="JSON, as in a process's execution.")
     outputs: str | None = Field(None, description="Ids of the wanted outputs, with commas between them.")
+
+
+def _field(option: Option) -> tuple[Any, Any]:
+    """An option as a field of the form, where a rectangle is a text."""
+    if option.name == "bbox":
+        return str | None, Field(
+            None,
+            description="x_min,y_min,x_max,y_max in the tiles' CRS.",
+            json_schema_extra=patterns.stated(patterns.WINDOW),
+        )
+    return type_of(option) | None, Field(None, description=option.meta["doc"])
+
+
+JobForm: type[Answer] = create_model(
+    "JobForm",
+    __base__=FormOfFiles,
+    __doc__=FormOfFiles.__doc__,
+    **{one.input: _field(one) for one in served()},  # type: ignore[call-overload]
+)
+"""The form with the options of all processes."""

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import datetime as dt
+import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, BaseModel, Field, WithJsonSchema
 
 from pipeline.model import Status
+from service.errors import RequestError
 from service.jobs import JobStatus
 from service.wire import patterns
 
@@ -47,6 +49,39 @@ def entry_of(allowed: Iterable[str]) -> WithJsonSchema:
 Words = Annotated[list[str] | None, AfterValidator(words())]
 Statuses = Annotated[list[Annotated[str, entry_of(Status)]] | None, AfterValidator(words(list(Status)))]
 """Statuses of buildings."""
+
+
+def window(text: str, *, in_degrees: bool, northing_first: bool = False) -> list[tuple[float, float, float, float]]:
+    """The boxes of a parameter bbox, easting first: two where a window in degrees crosses the 180th meridian.
+
+    Raises
+    ------
+    RequestError
+        It is not a window.
+
+    Examples
+    --------
+    >>> window("170,-10,-170,10", in_degrees=True)
+    [(170.0, -10.0, 180.0, 10.0), (-180.0, -10.0, -170.0, 10.0)]
+    """
+    try:
+        # Python also reads 1_000
+        values = [float(part) for part in text.replace("_", "?").split(",", 6)]
+    except ValueError:
+        values = []
+    problem = f"query bbox is {text[:80]!r}"
+    if len(values) != 4 or not all(map(math.isfinite, values)):
+        raise RequestError([f"{problem}: give four numbers, such as 4.35,52.00,4.37,52.01"])
+    west, south, east, north = (values[k] for k in ((1, 0, 3, 2) if northing_first else range(4)))
+    if in_degrees and (max(abs(west), abs(east)) > 180.0 or max(abs(south), abs(north)) > 90.0):
+        raise RequestError([f"{problem}: longitudes reach from -180 to 180, latitudes to 90"])
+    if south > north:
+        raise RequestError([f"{problem}: its south {south:g} lies north of its north {north:g}"])
+    if west <= east:
+        return [(west, south, east, north)]
+    if not in_degrees:
+        raise RequestError([f"{problem}: its west {west:g} lies east of its east {east:g}"])
+    return [(west, south, 180.0, north), (-180.0, south, east, north)]
 
 
 def interval(text: str | None) -> tuple[dt.datetime | None, dt.datetime | None]:
@@ -89,7 +124,8 @@ def _instant(text: str, *, is_open: bool) -> dt.datetime | None:
         raise ValueError("use a day that exists, as in 2026-03-01T09:30:00Z") from None
 
 
-def _is_interval(text: str | None) -> str | None:
+def is_interval(text: str | None) -> str | None:
+    """Refuse a text that is not an interval."""
     interval(text)
     return text
 
@@ -116,7 +152,7 @@ class JobQuery(Page):
     q: Annotated[str | None, Field(max_length=200)] = Field(
         None, description="Only jobs with each of these words in title, id or process; case does not matter."
     )
-    datetime: Annotated[str | None, AfterValidator(_is_interval)] = Field(
+    datetime: Annotated[str | None, AfterValidator(is_interval)] = Field(
         None,
         description="Time of creation: an RFC 3339 time, or `a/b`, `../b`, `a/..`.",
         json_schema_extra=patterns.stated(patterns.INTERVAL),

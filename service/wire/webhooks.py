@@ -59,10 +59,6 @@ class Webhook(Answer):
     disabledReason: str | None = Field(None, description="Why nothing is sent.")
     created: Time
     updated: Time
-    pausedSince: Time | None = Field(
-        None, description="Time since which nothing is sent because the receiver did not keep up; a replay ends it."
-    )
-    notSent: int | None = Field(None, ge=1, description="Messages that wait for room or, while it is paused, a replay.")
     links: list[Link]
 
 

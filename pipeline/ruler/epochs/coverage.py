@@ -10,8 +10,8 @@ import numpy as np
 import shapely
 
 from pipeline.errors import GableworkError
+from pipeline.extras.footprints.footprints_file import read_area
 from pipeline.io.crs import SpatialReference
-from pipeline.io.footprints import read_area
 from pipeline.io.storage import sha256_of
 from pipeline.model import FloatArray
 from pipeline.runtime.manifest import RunManifest

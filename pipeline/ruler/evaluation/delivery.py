@@ -8,13 +8,13 @@ from enum import StrEnum
 
 import numpy as np
 
-from pipeline.model import FloatArray, IntArray, Status
+from pipeline.model import BoolArray, FloatArray, IntArray, Status
 from pipeline.ruler.evaluation.bootstrap import share
 from pipeline.ruler.evaluation.matching import MIN_SHARE, Matching, excused_models
 from pipeline.ruler.evaluation.measure import Better, Measure, defined
 from pipeline.ruler.evaluation.models import ModelSet, RoofModel
 from pipeline.ruler.evaluation.reference import Reference
-from pipeline.ruler.evaluation.subsets import MODELS_ALONE, Subset, measured, summed_over_units, total
+from pipeline.ruler.evaluation.subsets import MODELS_ALONE, Columns, Subset, measured_all, summed_over_units, total
 
 _ROUNDING = 1e-9
 
@@ -46,114 +46,52 @@ class Stands(StrEnum):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class DeliveryRow:
-    """One reference building."""
-
-    building: int
-    """Its index."""
-    building_id: str
-    """Its name."""
-    model: int
-    """Index of the model that stands for it; -1 for none."""
-    delivered: Delivered
-    """Its delivery."""
-    parts: int
-    """Number of models that are parts (`Stands.PART`) and lie mostly on it."""
-    joined: bool
-    """Whether a model covers at least half of it and of another building."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class DeliveredModel:
-    """One model."""
-
-    model: int
-    """Its index."""
-    model_id: str
-    """Its name."""
-    status: Status
-    """ok or fallback."""
-    building: int
-    """Index of the reference building that it stands for, else of the one with the largest common area; -1 for none."""
-    share_on_reference: float
-    """Share of its footprint on reference buildings; for a part of a division that of all parts together."""
-    covers: int
-    """Number of reference buildings that it covers by at least half."""
-    stands: Stands
-    """Its place."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Delivery:
-    """The delivery."""
+    """The delivery: columns of all reference buildings and of all models, in their orders."""
 
-    buildings: tuple[DeliveryRow, ...]
-    """One per reference building."""
-    models: tuple[DeliveredModel, ...]
-    """One per model."""
+    buildings: Columns
+    """`model`: index of the model that stands for it, -1 for none; `delivered`; `parts`: models that are parts
+    (`Stands.PART`) and lie mostly on it; `joined`: whether a model covers at least half of it and of another one."""
+    models: Columns
+    """`building`: index of the one that it stands for, else of the one with the largest common area, -1 for none;
+    `on_reference`: share of its footprint on reference buildings, for a part of a division that of all parts together;
+    `covers`: number of buildings that it covers by at least half; `stands`."""
 
 
 def score_delivery(models: Sequence[RoofModel], reference: Reference, matching: Matching) -> Delivery:
-    """The delivery for each reference building and the place of each model, in their orders."""
-    pairs = matching.overlaps
-    cut = np.array([building.touches_data_edge for building in reference.buildings], np.bool_)
+    """The delivery for each reference building and the place of each model."""
+    count, pairs, own, mostly = len(reference.buildings), matching.overlaps, matching.reference_of, matching.mostly_on
+    cut = np.array([*(building.touches_data_edge for building in reference.buildings), False], np.bool_)
     covering = pairs.common_m2 >= (MIN_SHARE - _ROUNDING) * matching.reference_m2[pairs.first]
     covers = np.bincount(pairs.second[covering], minlength=len(models))
-    excused = excused_models(models, reference)
-    rows = []
-    for k, model in enumerate(models):
-        own = int(matching.reference_of[k])
-        mostly = int(matching.mostly_on[k])
-        on, inside = float(matching.share_on_reference[k]), float(matching.share_in_extent[k])
-        lies_on = on >= MIN_SHARE - _ROUNDING
-        if covers[k] > 1 and (own >= 0 or lies_on):
-            stands = Stands.JOINS
-        elif own >= 0:
-            stands = Stands.FOR_BUILDING
-        elif covers[k] <= 1 and (cut[mostly] if mostly >= 0 else excused[k]):
-            stands = Stands.LEFT_OUT
-        elif lies_on:
-            stands = Stands.PART
-        elif reference.extent is not None and (inside >= MIN_SHARE - _ROUNDING or covers[k] > 1):
-            stands = Stands.FALSE
-        else:
-            stands = Stands.LEFT_OUT
-        rows.append(
-            DeliveredModel(
-                model=k,
-                model_id=model.building_id,
-                status=model.status,
-                building=own if own >= 0 else mostly,
-                share_on_reference=on,
-                covers=int(covers[k]),
-                stands=stands,
-            )
-        )
-    joined = np.zeros(len(reference.buildings), np.bool_)
-    joined[pairs.first[covering][covers[pairs.second[covering]] > 1]] = True
-    on_building = np.array([row.building for row in rows if row.stands is Stands.PART], np.int64)
-    parts = np.bincount(on_building, minlength=len(reference.buildings))
-    buildings = tuple(
-        DeliveryRow(
-            building=k,
-            building_id=building.building_id,
-            model=int(matching.model_of[k]),
-            delivered=_delivered(models[matching.model_of[k]]) if matching.model_of[k] >= 0 else Delivered.NOTHING,
-            parts=int(parts[k]),
-            joined=bool(joined[k]),
-        )
-        for k, building in enumerate(reference.buildings)
+    lies_on = matching.share_on_reference >= MIN_SHARE - _ROUNDING
+    inside = matching.share_in_extent >= MIN_SHARE - _ROUNDING
+    excused = np.where(mostly >= 0, cut[mostly], excused_models(models, reference))
+    stands = np.select(
+        [
+            (covers > 1) & ((own >= 0) | lies_on),
+            own >= 0,
+            (covers <= 1) & excused,
+            lies_on,
+            np.full(len(models), reference.extent is not None) & (inside | (covers > 1)),
+        ],
+        [Stands.JOINS, Stands.FOR_BUILDING, Stands.LEFT_OUT, Stands.PART, Stands.FALSE],
+        Stands.LEFT_OUT,
     )
-    return Delivery(buildings=buildings, models=tuple(rows))
+    building = np.where(own >= 0, own, mostly)
+    joined = np.zeros(count, np.bool_)
+    joined[pairs.first[covering][covers[pairs.second[covering]] > 1]] = True
+    delivered = np.array([*map(_delivered, models), Delivered.NOTHING])[matching.model_of]
+    parts = np.bincount(building[stands == Stands.PART], minlength=count)
+    return Delivery(
+        buildings={"model": matching.model_of, "delivered": delivered, "parts": parts, "joined": joined},
+        models={"building": building, "on_reference": matching.share_on_reference, "covers": covers, "stands": stands},
+    )
 
 
-def of_delivered_models(delivery: Delivery, models: Sequence[RoofModel], whole_of: IntArray) -> Delivery:
+def of_delivered_models(delivery: Delivery, whole_of: IntArray) -> Delivery:
     """The same with a row per delivered model: parts of a division stand where their whole does (`WholeModels`)."""
-    rows = [
-        dataclasses.replace(delivery.models[whole], model=k, model_id=model.building_id, status=model.status)
-        for k, (model, whole) in enumerate(zip(models, whole_of.tolist(), strict=True))
-    ]
-    return dataclasses.replace(delivery, models=tuple(rows))
+    return dataclasses.replace(delivery, models={name: column[whole_of] for name, column in delivery.models.items()})
 
 
 def _delivered(model: RoofModel) -> Delivered:
@@ -163,52 +101,44 @@ def _delivered(model: RoofModel) -> Delivered:
 
 def measures(delivery: Delivery, subset: Subset) -> list[Measure]:
     """The figures of one subset of the buildings. False models count in the subset `all` only."""
-    buildings = delivery.buildings
-    judged = [row for row in delivery.models if row.stands is not Stands.LEFT_OUT]
+    buildings, stands = delivery.buildings, delivery.models["stands"]
+    count, judged = len(buildings["model"]), np.flatnonzero(stands != Stands.LEFT_OUT)
+    stands = stands[judged]
     # A false model is a unit of its own, even if a corner of it touches a building.
-    place = [row.building for row in buildings]
-    place += [-1 if row.stands is Stands.FALSE else row.building for row in judged]
-    unit = [0] * len(buildings) + [row.model for row in judged]
-    first, second = np.zeros(len(buildings)), np.zeros(len(judged))
+    place = np.where(stands == Stands.FALSE, -1, delivery.models["building"][judged])
 
-    def of_buildings(values: list[bool]) -> FloatArray:
-        return np.concatenate([np.array(values, np.float64), second])
+    def of_buildings(values: BoolArray) -> FloatArray:
+        return np.concatenate([values.astype(np.float64), np.zeros(len(judged))])
 
-    def of_models(values: list[bool]) -> FloatArray:
-        return np.concatenate([first, np.array(values, np.float64)])
+    def of_models(values: BoolArray) -> FloatArray:
+        return np.concatenate([np.zeros(count), values.astype(np.float64)])
 
     columns = summed_over_units(
         subset,
-        np.array(place, np.int64),
-        np.array(unit, np.int64),
-        {kind.value: of_buildings([row.delivered is kind for row in buildings]) for kind in Delivered}
+        np.concatenate([np.arange(count), place]),
+        np.concatenate([np.zeros(count, np.int64), judged]),
+        {kind.value: of_buildings(buildings["delivered"] == kind) for kind in Delivered}
         | {
-            "buildings": of_buildings([True] * len(buildings)),
-            "split": of_buildings([row.parts + (row.model >= 0) > 1 for row in buildings]),
-            "joined": of_buildings([row.joined for row in buildings]),
-            "models": of_models([True] * len(judged)),
-            "standing": of_models([row.stands is not Stands.FALSE for row in judged]),
+            "buildings": of_buildings(np.ones(count, np.bool_)),
+            "split": of_buildings(buildings["parts"] + (buildings["model"] >= 0) > 1),
+            "joined": of_buildings(buildings["joined"]),
+            "models": of_models(np.ones(len(judged), np.bool_)),
+            "standing": of_models(stands != Stands.FALSE),
         }
-        | {kind.name: of_models([row.stands is kind for row in judged]) for kind in Stands},
+        | {f"{kind}_models": of_models(stands == kind) for kind in Stands},
     )
     n_buildings, n_models = float(columns["buildings"].sum()), float(columns["models"].sum())
-    shares = [
-        ("delivery.lod2", Delivered.LOD2.value),
-        ("delivery.block", Delivered.BLOCK.value),
-        ("delivery.nothing", Delivered.NOTHING.value),
-        ("delivery.split", "split"),
-        ("delivery.joined", "joined"),
-    ]
-    counts = [
-        ("delivery.false_models", Stands.FALSE.name),
-        ("delivery.part_models", Stands.PART.name),
-        ("delivery.joining_models", Stands.JOINS.name),
-    ]
-    return [
-        *(measured(name, columns, share(column, "buildings"), n=n_buildings, subset=subset) for name, column in shares),
-        measured("delivery.correctness", columns, share("standing", "models"), n=n_models, subset=subset),
-        *(measured(name, columns, total(column), n=n_models, subset=subset) for name, column in counts),
-    ]
+    of_all = (*(kind.value for kind in Delivered), "split", "joined")
+    counts = (("false_models", Stands.FALSE), ("part_models", Stands.PART), ("joining_models", Stands.JOINS))
+    return measured_all(
+        columns,
+        subset,
+        [
+            *((f"delivery.{name}", share(name, "buildings"), n_buildings) for name in of_all),
+            ("delivery.correctness", share("standing", "models"), n_models),
+            *((f"delivery.{name}", total(f"{kind}_models"), n_models) for name, kind in counts),
+        ],
+    )
 
 
 def record_measures(models: ModelSet) -> list[Measure]:
@@ -216,12 +146,8 @@ def record_measures(models: ModelSet) -> list[Measure]:
     status = [model.status for model in models.models] + [Status.FAILED] * len(models.failed)
     columns = {"records": np.ones(len(status))}
     columns |= {kind.value: np.array([one is kind for one in status], np.float64) for kind in Status}
-    return [
-        measured(
-            f"delivery.records_{kind.value}", columns, share(kind.value, "records"), n=len(status), subset=MODELS_ALONE
-        )
-        for kind in Status
-    ]
+    figures = [(f"delivery.records_{kind}", share(kind.value, "records"), len(status)) for kind in Status]
+    return measured_all(columns, MODELS_ALONE, figures)
 
 
 _OF_ALL = "share of all reference buildings "

@@ -11,13 +11,13 @@ right if at least half of its area lies on reference buildings.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import shapely
 from shapely import Polygon
 
-from pipeline.model import BoolArray, FloatArray
+from pipeline.model import BoolArray, FloatArray, IntArray
 from pipeline.ruler.evaluation.bootstrap import Share, Statistic, Sums, quality, share
 from pipeline.ruler.evaluation.building_raster import CELL_M, CellWindow, PlanRaster, PointRaster, edge_ring, windows_of
 from pipeline.ruler.evaluation.matching import (
@@ -31,7 +31,7 @@ from pipeline.ruler.evaluation.matching import (
 from pipeline.ruler.evaluation.measure import Definition, Measure, defined
 from pipeline.ruler.evaluation.models import RoofModel
 from pipeline.ruler.evaluation.reference import Reference
-from pipeline.ruler.evaluation.subsets import Subset, measured, summed_over_units
+from pipeline.ruler.evaluation.subsets import Columns, Subset, measured_all, summed_over_units
 from pipeline.scene import BUILDING_CLASS
 
 MIN_OVERLAP = 0.5
@@ -41,64 +41,24 @@ OBJECT_AREAS_M2 = (0.0, 10.0, 50.0)
 BLOCK_CELLS = 100
 """Side of the blocks of 50 m that are the units of the bootstrap by area."""
 
-_COUNTS = ("both", "reference", "found")
+_LAYERS = ("both", "reference", "found", "both_without_ring", "reference_without_ring", "found_without_ring")
 _EVERYWHERE = (-np.inf, -np.inf, np.inf, np.inf)
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class DetectionBlock:
-    """Cells of one block of 50 m, inside the extent of the reference."""
-
-    row: int
-    """Index of the block along northing, 0 at the origin of the CRS."""
-    column: int
-    """Index along easting."""
-    both: int
-    """Cells that are building in the reference and in the models."""
-    reference: int
-    """Cells that are building in the reference."""
-    found: int
-    """Cells that are building in the models."""
-    both_without_ring: int
-    """`both` without the cells at the edges of the reference."""
-    reference_without_ring: int
-    """`reference` without them."""
-    found_without_ring: int
-    """`found` without them."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class DetectedObject:
-    """A reference building or a model, and its share on the other kind."""
-
-    name: str
-    """Its building_id."""
-    building: int
-    """Index of the reference building; for a model the one with the largest common area, -1 for none."""
-    area_m2: float
-    """Area of its footprint."""
-    overlap: float
-    """Share of its area on models, or for a model on reference buildings."""
-    counts: bool
-    """False if it touches the edge of the data; for a model if it lies on such a building or at that edge, or where
-    the reference is incomplete."""
-
-    @property
-    def found(self) -> bool:
-        """Whether a building is found, or a model right."""
-        return self.overlap >= MIN_OVERLAP
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Detection:
     """All rows of the measures of detection."""
 
-    blocks: tuple[DetectionBlock, ...]
-    """By row and column, without blocks that have no building cell; empty without reference buildings."""
-    buildings: tuple[DetectedObject, ...]
-    """One per reference building, in their order."""
-    models: tuple[DetectedObject, ...]
-    """One per model, in their order."""
+    blocks: Columns
+    """Blocks of 50 m with any building cell inside the extent of the reference: `row` and `column`, 0 at the origin of
+    the CRS, ascending; cells that are building in `reference`, `found` by the models, or `both`, and the same
+    `_without_ring`: without the cells at the edges of the reference."""
+    buildings: Columns
+    """Reference buildings: `building`, their index; `area_m2`; `overlap`, the share of it on models; `counts`, False if
+    it touches the edge of the data."""
+    models: Columns
+    """Models: `building` with the largest common area, -1 for none; `area_m2`; `overlap` with reference buildings;
+    `counts`, False if it lies on a cut building, at the edge of the data, or where the reference is incomplete."""
     has_correctness: bool
     """False if the reference is complete nowhere, so no model can be wrong."""
 
@@ -117,24 +77,23 @@ def detect(models: Sequence[RoofModel], reference: Reference) -> Detection:
 # ----------------------------------------------------------------------------------------------------------- by area
 
 
-def _blocks(models: Sequence[RoofModel], reference: Reference) -> tuple[DetectionBlock, ...]:
+def _blocks(models: Sequence[RoofModel], reference: Reference) -> Columns:
     """Count cells per block, window by window."""
     outlines = [building.footprint for building in reference.buildings]
     found = [model.footprint for model in models]
-    if not outlines and reference.extent is None:
-        return ()
-    of_models = PlanRaster(found)
-    known = PlanRaster(outlines if reference.extent is None else _polygons(reference.extent))
-    of_reference = _class_raster(reference).window if reference.outlines == "given" else PlanRaster(outlines).window
-    blocks: list[DetectionBlock] = []
-    for window in windows_of(
-        _bounds_within([*outlines, *found], outlines if reference.extent is None else [reference.extent])
-    ):
-        around = of_reference(window.grown(1))
-        ring = edge_ring(around)[1:-1, 1:-1]
-        counted = known.window(window)
-        blocks += _count(window, around[1:-1, 1:-1] & counted, of_models.window(window) & counted, ring)
-    return tuple(sorted(blocks, key=lambda block: (block.row, block.column)))
+    names = ("row", "column", *_LAYERS)
+    blocks = [np.zeros((0, len(names)), np.int64)]
+    if outlines or reference.extent is not None:
+        judged = outlines if reference.extent is None else [reference.extent]
+        of_models, known = PlanRaster(found), PlanRaster(_polygons(judged))
+        of_reference = _class_raster(reference) if reference.outlines == "given" else PlanRaster(outlines)
+        for window in windows_of(_bounds_within([*outlines, *found], judged)):
+            around = of_reference.window(window.grown(1))
+            ring = edge_ring(around)[1:-1, 1:-1]
+            counted = known.window(window)
+            blocks.append(_count(window, around[1:-1, 1:-1] & counted, of_models.window(window) & counted, ring))
+    rows = np.concatenate(blocks)
+    return dict(zip(names, rows[np.lexsort((rows[:, 1], rows[:, 0]))].T, strict=True))
 
 
 def _bounds_within(areas: Sequence[shapely.Geometry], known: Sequence[shapely.Geometry]) -> FloatArray:
@@ -156,70 +115,45 @@ def _class_raster(reference: Reference) -> PointRaster:
     return raster
 
 
-def _count(window: CellWindow, reference: BoolArray, found: BoolArray, ring: BoolArray) -> list[DetectionBlock]:
-    """The blocks of a window with any building cell."""
+def _count(window: CellWindow, reference: BoolArray, found: BoolArray, ring: BoolArray) -> IntArray:
+    """Row, column and `_LAYERS` of the blocks of a window with any building cell, (n, 8)."""
     layers = []
     for counted in (np.ones_like(ring), ~ring):
         layers += [reference & found & counted, reference & counted, found & counted]
     n_rows, n_columns = window.rows // BLOCK_CELLS, window.columns // BLOCK_CELLS
-    sums = [
-        layer.reshape(n_rows, BLOCK_CELLS, n_columns, BLOCK_CELLS).sum(axis=(1, 3), dtype=np.int64) for layer in layers
-    ]
+    sums = np.array(layers).reshape(-1, n_rows, BLOCK_CELLS, n_columns, BLOCK_CELLS).sum(axis=(2, 4), dtype=np.int64)
     rows, columns = np.nonzero(sums[1] + sums[2])
-    return [
-        DetectionBlock(
-            row=window.row // BLOCK_CELLS + r,
-            column=window.column // BLOCK_CELLS + c,
-            both=int(sums[0][r, c]),
-            reference=int(sums[1][r, c]),
-            found=int(sums[2][r, c]),
-            both_without_ring=int(sums[3][r, c]),
-            reference_without_ring=int(sums[4][r, c]),
-            found_without_ring=int(sums[5][r, c]),
-        )
-        for r, c in zip(rows.tolist(), columns.tolist(), strict=True)
-    ]
+    place = (window.row // BLOCK_CELLS + rows, window.column // BLOCK_CELLS + columns)
+    return np.column_stack([*place, *sums[:, rows, columns]])
 
 
 # --------------------------------------------------------------------------------------------------------- by object
 
 
-def _objects(
-    models: Sequence[RoofModel], reference: Reference
-) -> tuple[tuple[DetectedObject, ...], tuple[DetectedObject, ...]]:
+def _objects(models: Sequence[RoofModel], reference: Reference) -> tuple[Columns, Columns]:
     """Reference buildings and models with the share of their area on the other kind."""
     truth = sound_polygons([building.footprint for building in reference.buildings])
     made = sound_polygons([model.footprint for model in models])
     pairs = overlapping(truth, made)
     best = mostly_on(len(made), pairs)
-    cut = np.array([building.touches_data_edge for building in reference.buildings], np.bool_)
+    cut = np.array([*(building.touches_data_edge for building in reference.buildings), False], np.bool_)
     known = np.zeros(len(made), np.bool_)
     if reference.extent is not None:
         known = where_judged(made, truth, pairs, reference.extent)
-        known &= ~np.where(best >= 0, cut[best] if len(cut) else False, excused_models(models, reference))
-    overlap_truth = share_covered(truth, made, pairs.swapped())
-    overlap_made = share_covered(made, truth, pairs)
+        known &= ~np.where(best >= 0, cut[best], excused_models(models, reference))
     return (
-        tuple(
-            DetectedObject(
-                name=building.building_id,
-                building=number,
-                area_m2=float(truth[number].area),
-                overlap=float(overlap_truth[number]),
-                counts=not building.touches_data_edge,
-            )
-            for number, building in enumerate(reference.buildings)
-        ),
-        tuple(
-            DetectedObject(
-                name=model.building_id,
-                building=int(best[number]),
-                area_m2=float(made[number].area),
-                overlap=float(overlap_made[number]),
-                counts=bool(known[number]),
-            )
-            for number, model in enumerate(models)
-        ),
+        {
+            "building": np.arange(len(truth)),
+            "area_m2": shapely.area(truth),
+            "overlap": share_covered(truth, made, pairs.swapped()),
+            "counts": ~cut[:-1],
+        },
+        {
+            "building": best,
+            "area_m2": shapely.area(made),
+            "overlap": share_covered(made, truth, pairs),
+            "counts": known,
+        },
     )
 
 
@@ -272,59 +206,62 @@ def detection_measures(rows: Detection, subset: Subset) -> list[Measure]:
 
 
 def _area_measures(rows: Detection, subset: Subset) -> list[Measure]:
-    if not rows.blocks:
+    if not len(rows.blocks["row"]):
         return []
     found = []
     for suffix in _RING:
-        columns = {
-            name: np.array([getattr(block, name + suffix) for block in rows.blocks], np.float64) for name in _COUNTS
-        }
-        union = columns["reference"].sum() + columns["found"].sum() - columns["both"].sum()
+        columns = {name: rows.blocks[name + suffix].astype(np.float64) for name in _LAYERS[:3]}
+        sums = {name: float(column.sum()) for name, column in columns.items()}
         figures: list[tuple[str, Statistic, float]] = [
-            ("completeness", share("both", "reference"), columns["reference"].sum())
+            ("completeness", share("both", "reference"), sums["reference"]),
+            ("correctness", share("both", "found"), sums["found"]),
+            ("quality", quality("both", "reference", "found"), sums["reference"] + sums["found"] - sums["both"]),
         ]
-        if rows.has_correctness:
-            figures += [
-                ("correctness", share("both", "found"), columns["found"].sum()),
-                ("quality", quality("both", "reference", "found"), union),
-            ]
-        found += [
-            measured(f"detection.area_{name}{suffix}", columns, statistic, n=n, subset=subset)
-            for name, statistic, n in figures
-        ]
+        found += _named(rows, columns, subset, "area", suffix, figures)
     return found
 
 
 def _object_measures(rows: Detection, subset: Subset) -> list[Measure]:
     """Completeness, correctness and quality of objects of each least size."""
-    if not rows.buildings and not rows.has_correctness:
+    if not len(rows.buildings["counts"]) and not rows.has_correctness:
         return []
     found = []
     for least in OBJECT_AREAS_M2:
-        buildings = [one for one in rows.buildings if one.counts and one.area_m2 >= least]
-        models = [one for one in rows.models if one.counts and one.area_m2 >= least]
-        objects, zeros = (*buildings, *models), ([0.0] * len(buildings), [0.0] * len(models))
-        columns: dict[str, list[float]] = {
-            "wanted": [*(1.0 for _ in buildings), *zeros[1]],
-            "hit": [*(float(one.found) for one in buildings), *zeros[1]],
-            "made": [*zeros[0], *(1.0 for _ in models)],
-            "right": [*zeros[0], *(float(one.found) for one in models)],
-        }
+        kinds = [
+            {name: column[one["counts"] & (one["area_m2"] >= least)] for name, column in one.items()}
+            for one in (rows.buildings, rows.models)
+        ]
+        building = np.concatenate([one["building"] for one in kinds])
+        is_model = np.repeat([False, True], [len(one["building"]) for one in kinds])
+        right = np.concatenate([one["overlap"] for one in kinds]) >= MIN_OVERLAP
+        columns = {"wanted": ~is_model, "hit": ~is_model & right, "made": is_model, "right": is_model & right}
         arrays = summed_over_units(
             subset,
-            np.array([one.building for one in objects], np.int64),
-            np.arange(len(objects)),
-            {name: np.array(column, np.float64) for name, column in columns.items()},
+            building,
+            np.arange(len(building)),
+            {name: column.astype(np.float64) for name, column in columns.items()},
         )
         wanted, made = arrays["wanted"].sum(), arrays["made"].sum()
-        figures: list[tuple[str, Statistic, float]] = [("completeness", share("hit", "wanted"), wanted)]
-        if rows.has_correctness:
-            figures += [("correctness", share("right", "made"), made), ("quality", _OBJECT_QUALITY, wanted + made)]
-        found += [
-            measured(f"detection.object_{name}{_suffix(least)}", arrays, statistic, n=n, subset=subset)
-            for name, statistic, n in figures
+        figures: list[tuple[str, Statistic, float]] = [
+            ("completeness", share("hit", "wanted"), wanted),
+            ("correctness", share("right", "made"), made),
+            ("quality", _OBJECT_QUALITY, wanted + made),
         ]
+        found += _named(rows, arrays, subset, "object", _suffix(least), figures)
     return found
+
+
+def _named(
+    rows: Detection,
+    columns: Mapping[str, FloatArray],
+    subset: Subset,
+    kind: str,
+    suffix: str,
+    figures: Sequence[tuple[str, Statistic, float]],
+) -> list[Measure]:
+    """The figures of one kind and size; completeness alone if no model can be wrong."""
+    possible = figures if rows.has_correctness else figures[:1]
+    return measured_all(columns, subset, [(f"detection.{kind}_{name}{suffix}", of, n) for name, of, n in possible])
 
 
 def _object_quality(sums: Sums) -> FloatArray:
@@ -337,6 +274,6 @@ def _object_quality(sums: Sums) -> FloatArray:
 _OBJECT_QUALITY = Share(figure=_object_quality, denominator="wanted")
 
 
-def _polygons(geometry: shapely.Geometry) -> list[Polygon]:
-    """The polygons of an extent."""
-    return [part for part in shapely.get_parts(geometry).tolist() if isinstance(part, Polygon)]
+def _polygons(areas: Sequence[shapely.Geometry]) -> list[Polygon]:
+    """The polygons of some areas."""
+    return [part for part in shapely.get_parts([*areas]).tolist() if isinstance(part, Polygon)]

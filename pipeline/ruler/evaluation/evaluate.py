@@ -130,30 +130,30 @@ def _buildings(
     on_step("footprints")
     matching = match_footprints(wholes.models, reference)
     delivered = delivery.of_delivered_models(
-        delivery.score_delivery(wholes.models, reference, matching), models.models, wholes.whole_of
+        delivery.score_delivery(wholes.models, reference, matching), wholes.whole_of
     )
     outlines = footprints.score_footprints(wholes.models, reference, matching)
     on_step("roof faces")
     face_score = faces.score_faces(models.models, reference)
     types = (
-        roof_types.score_roof_types(wholes.models, reference, matching, face_score) if has_roof_types(models) else ()
+        roof_types.score_roof_types(wholes.models, reference, matching, face_score) if has_roof_types(models) else {}
     )
     on_step("roof surfaces")
     surfaces = surface.score_surface(models.models, reference)
     on_step("points")
-    residuals = building_residuals(models.models, reference) if reference.tiles else []
+    residuals = building_residuals(models.models, reference) if reference.tiles else None
     on_step("detection")
     detected = detect(models.models, reference)
     on_step("intervals")
     found["buildings"] = tables.building_table(reference, wholes, outlines, types, residuals, surfaces)
     found["models"] = tables.model_table(models, solids, delivered)
-    if residuals:
+    if residuals is not None:
         found["residual_histogram"] = tables.residual_histogram(residuals)
     if reference.has_faces:
         found["true_faces"] = tables.true_face_table(face_score, reference)
         found["model_faces"] = tables.model_face_table(face_score, models.models, reference)
         found["topology"] = tables.topology_table(face_score)
-        found |= tables.outcome_tables(types, groups) if types else {}
+        found |= tables.outcome_table(types, groups) if types else {}
     measures = delivery.record_measures(models)
     for group in groups:
         measures += delivery.measures(delivered, group)

@@ -13,15 +13,15 @@ tilted face is off.
 from __future__ import annotations
 
 import dataclasses
-import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from enum import StrEnum
+from typing import Any
 
 import numpy as np
 
 from pipeline.model import BoolArray, FloatArray, IntArray
-from pipeline.ruler.evaluation.bootstrap import Share, Sums, quality, share
-from pipeline.ruler.evaluation.face_matching import FaceMatch, match_faces
+from pipeline.ruler.evaluation.bootstrap import Share, Statistic, Sums, quality, share
+from pipeline.ruler.evaluation.face_matching import Compared, FaceMatch, match_faces
 from pipeline.ruler.evaluation.matching import (
     excused_models,
     mostly_on,
@@ -33,8 +33,8 @@ from pipeline.ruler.evaluation.matching import (
 from pipeline.ruler.evaluation.measure import Better, Measure, defined
 from pipeline.ruler.evaluation.models import RoofModel
 from pipeline.ruler.evaluation.reference import Reference
-from pipeline.ruler.evaluation.subsets import Subset, measured, summed_over_units, total
-from pipeline.ruler.evaluation.topology import FaceComponent, Topology, TopologyInput, face_components
+from pipeline.ruler.evaluation.subsets import Columns, Subset, measured_all, summed_over_units, total
+from pipeline.ruler.evaluation.topology import Topology, face_components
 
 MIN_FACE_AREA_M2 = 10.0
 """Smaller true faces need not be found, smaller faces of a model are not wrong; in the plane of the face."""
@@ -58,89 +58,24 @@ class FaceVerdict(StrEnum):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class ReferenceFace:
-    """One true roof face. Several with one `unit` count as one: the parts of a bent hip face."""
-
-    building: int
-    """Index of its reference building."""
-    building_id: str
-    """Name of it."""
-    plane_id: int
-    """Its number in the building."""
-    group: int
-    """As in the reference; -1 for none."""
-    unit: int
-    """Number of the counted unit: a face alone, or a group."""
-    area_m2: float
-    """Its own area in its plane."""
-    slope_deg: float
-    """0 is horizontal."""
-    n_points: int
-    """Its own points; -1 if unknown."""
-    unit_area_m2: float
-    """Area of the unit."""
-    to_be_found: bool
-    """Whether the unit has at least 10 m2 and 11 points, and the data edge does not cut its building."""
-    found: bool
-    """Whether the unit was found."""
-    matched: bool
-    """Whether a model face matches this face itself, or its group as a whole."""
-    as_group: bool
-    """Whether the figures below are those of its group as one face with its mean plane."""
-    model: int
-    """Index of the model of the matching face, else of the one that overlaps it most; -1 without any."""
-    model_id: str | None
-    """Name of that model."""
-    model_plane_id: int
-    """Number of that face in its model; -1 without any."""
-    overlap_reference: float
-    """Common area as share of this face (of the group), in plan."""
-    overlap_model: float
-    """Common area as share of the model face, in plan."""
-    angle_deg: float
-    """Between the normals; nan without an overlap."""
-    offset_m: float
-    """Model minus true plane, mean over the common area, across the true plane; nan without an overlap."""
-    topology: Topology | None
-    """Topology of the connected component; None below 10 m2 and at the data edge."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class ModelFace:
-    """One roof face of a model."""
-
-    model: int
-    """Index of its model."""
-    model_id: str
-    """Name of it."""
-    plane_id: int
-    """Its number in the model."""
-    area_m2: float
-    """In its plane."""
-    slope_deg: float
-    """0 is horizontal."""
-    building: int
-    """Index of the reference building that it matches in, else of the one that it lies on most; -1 for none."""
-    matched: bool
-    """Whether it matches a true face, of any size."""
-    unit: int
-    """The unit of that face; -1 for none."""
-    verdict: FaceVerdict
-    """What it counts as."""
-    topology: Topology | None
-    """Topology of the connected component; None below 10 m2 and where it is left out."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class FaceScore:
-    """All faces with their verdicts."""
+    """All faces with their verdicts, as columns."""
 
-    reference: tuple[ReferenceFace, ...]
-    """One per true roof face, building by building."""
-    models: tuple[ModelFace, ...]
-    """One per model face, model by model."""
-    components: tuple[FaceComponent, ...]
-    """Faces of at least 10 m2 that lie on one another."""
+    true: Columns
+    """True roof faces, building by building. `building`, `building_id`, `plane_id`, `group` (-1 for none), `unit`: the
+    number of what counts as one, a face alone or a group such as the parts of a bent hip face. `area_m2` in its plane,
+    `slope_deg`, `n_points` (-1 if unknown), `unit_area_m2`. `to_be_found`: whether the unit has at least 10 m2 and 11
+    points, and the data edge does not cut its building; `found`: whether the unit was found; `matched`: whether a model
+    face matches this face itself, or its group as a whole; `as_group`: whether the figures are those of its group as
+    one face with its mean plane. `model_id`, `model_plane_id`: the matching face, else the one that overlaps it most,
+    None and -1 without any. `overlap_true`, `overlap_model`: common area as share of both, in plan; `angle_deg` between
+    the normals, `offset_m` of the model across the true plane, nan without an overlap; `topology` of the component."""
+    made: Columns
+    """Faces of the models, model by model. `model`, `model_id`, `plane_id`, `area_m2`, `slope_deg`; `building`: the
+    reference building that it matches in, else the one that it lies on most, -1 for none; `found`: whether it matches a
+    true face of any size; `verdict`; `topology`."""
+    components: Columns
+    """Faces of at least 10 m2 that lie on one another: see `face_components`."""
 
 
 def score_faces(models: Sequence[RoofModel], reference: Reference) -> FaceScore:
@@ -151,7 +86,7 @@ def score_faces(models: Sequence[RoofModel], reference: Reference) -> FaceScore:
     (`excused_models`). A cut model may still find faces.
     """
     if not reference.has_faces:
-        return FaceScore(reference=(), models=(), components=())
+        return FaceScore(true={}, made={}, components={})
     match = match_faces(models, reference.buildings)
     units = len(match.pieces)
     cut = np.array([building.touches_data_edge for building in reference.buildings], np.bool_)
@@ -168,29 +103,74 @@ def score_faces(models: Sequence[RoofModel], reference: Reference) -> FaceScore:
     made_large = match.made.area_m2 >= MIN_FACE_AREA_M2 - _ROUNDING
     unit_of = match.matched_unit
     # Pieces of a bent face may be small: they count with the large unit that they match.
-    matched_large = np.append(large, False)[unit_of]
     components, unit_topology, made_topology = face_components(
-        TopologyInput(
-            unit=match.unit[match.pairs.overlaps.first],
-            face=match.pairs.overlaps.second,
-            common_m2=match.pairs.overlaps.common_m2,
-            unit_m2=summed(match.unit, match.true.plan_m2, units),
-            face_m2=match.made.plan_m2,
-            unit_counts=large & ~unit_cut,
-            face_counts=(made_large | matched_large) & ~left_out,
-            unit_building=unit_building,
-            face_building=building,
-            face_model=match.made.owner,
-            face_group=np.where((unit_of >= 0) & (match.pieces[unit_of] > 1), unit_of, -1) if units else unit_of,
-        )
+        match,
+        large & ~unit_cut,
+        (made_large | np.append(large, False)[unit_of]) & ~left_out,
+        unit_building,
+        building,
     )
+    true_faces = [(one.building_id, face) for one in reference.buildings for face in one.surfaces]
+    made_faces = [(one.building_id, face) for one in models for face in one.surfaces]
+    model_ids = np.array([*(name for name, _ in made_faces), None], object)
+    planes = np.array([*(face.plane_id for _, face in made_faces), -1], np.int64)
+    unit, as_group = match.unit, match.whole_of[match.unit] >= 0
+    shown = _shown_pairs(match, as_group)
+
+    def of_pair(figure: Callable[[Compared], IntArray | FloatArray], nothing: float) -> Any:
+        """A figure of the pair that is shown for each true face."""
+        return np.concatenate([figure(match.pairs), figure(match.wholes), [nothing]])[shown]
+
+    face = of_pair(lambda pairs: pairs.overlaps.second, -1)
     return FaceScore(
-        reference=_reference_rows(models, reference, match, points, unit_m2, to_be_found, unit_topology),
-        models=_model_rows(
-            models, match, building, _verdicts(unit_of, to_be_found, made_large, left_out), made_topology
-        ),
+        true={
+            "building": match.true.owner,
+            "building_id": np.array([name for name, _ in true_faces], object),
+            "plane_id": np.array([face.plane_id for _, face in true_faces], np.int64),
+            "group": np.array([face.group for _, face in true_faces], np.int64),
+            "unit": unit,
+            "area_m2": match.true.area_m2,
+            "slope_deg": match.true.slope_deg,
+            "n_points": points,
+            "unit_area_m2": unit_m2[unit],
+            "to_be_found": to_be_found[unit],
+            "found": match.found[unit],
+            "matched": as_group | (match.pair_of >= 0),
+            "as_group": as_group,
+            "model_id": model_ids[face],
+            "model_plane_id": planes[face],
+            "overlap_true": of_pair(lambda pairs: pairs.share_true, 0.0),
+            "overlap_model": of_pair(lambda pairs: pairs.share_model, 0.0),
+            "angle_deg": of_pair(lambda pairs: pairs.angle_deg, np.nan),
+            "offset_m": of_pair(lambda pairs: pairs.offset_m, np.nan),
+            "topology": unit_topology[unit],
+        },
+        made={
+            "model": match.made.owner,
+            "model_id": model_ids[:-1],
+            "plane_id": planes[:-1],
+            "area_m2": match.made.area_m2,
+            "slope_deg": match.made.slope_deg,
+            "building": building,
+            "found": unit_of >= 0,
+            "verdict": np.select(
+                [left_out, np.append(to_be_found, False)[unit_of], unit_of >= 0, made_large],
+                [FaceVerdict.LEFT_OUT, FaceVerdict.RIGHT, FaceVerdict.NEITHER, FaceVerdict.WRONG],
+                FaceVerdict.NEITHER,
+            ),
+            "topology": made_topology,
+        },
         components=components,
     )
+
+
+def _shown_pairs(match: FaceMatch, as_group: BoolArray) -> IntArray:
+    """The pair that is shown for each true face, (n,), among all `pairs` and then all `wholes`; -1 for none."""
+    nearest = np.full(len(match.unit), -1, np.int64)
+    by_area = np.argsort(match.pairs.overlaps.common_m2, kind="stable")
+    nearest[match.pairs.overlaps.first[by_area]] = by_area  # the largest comes last
+    whole = match.whole_of[match.unit] + len(match.pairs.fits)
+    return np.where(as_group, whole, np.where(match.pair_of >= 0, match.pair_of, nearest))
 
 
 def _points(reference: Reference) -> IntArray:
@@ -226,171 +206,80 @@ def _judged(
     return building, left_out
 
 
-def _verdicts(
-    unit_of: IntArray, to_be_found: BoolArray, made_large: BoolArray, left_out: BoolArray
-) -> list[FaceVerdict]:
-    verdicts = []
-    for unit, large, out in zip(unit_of.tolist(), made_large.tolist(), left_out.tolist(), strict=True):
-        if out:
-            verdicts.append(FaceVerdict.LEFT_OUT)
-        elif unit >= 0:
-            verdicts.append(FaceVerdict.RIGHT if to_be_found[unit] else FaceVerdict.NEITHER)
-        else:
-            verdicts.append(FaceVerdict.WRONG if large else FaceVerdict.NEITHER)
-    return verdicts
-
-
-def _reference_rows(
-    models: Sequence[RoofModel],
-    reference: Reference,
-    match: FaceMatch,
-    points: IntArray,
-    unit_m2: FloatArray,
-    to_be_found: BoolArray,
-    topology: Sequence[Topology | None],
-) -> tuple[ReferenceFace, ...]:
-    planes = [surface.plane_id for model in models for surface in model.surfaces]
-    nearest = np.full(len(match.unit), -1, np.int64)
-    by_area = np.argsort(match.pairs.overlaps.common_m2, kind="stable")
-    nearest[match.pairs.overlaps.first[by_area]] = by_area  # the largest comes last
-    area, slope = match.true.area_m2, match.true.slope_deg
-    rows = []
-    surfaces = [surface for building in reference.buildings for surface in building.surfaces]
-    for k, surface in enumerate(surfaces):
-        unit, owner = int(match.unit[k]), int(match.true.owner[k])
-        as_group = bool(match.whole_of[unit] >= 0)
-        itself = bool(match.pair_of[k] >= 0)
-        shown = match.wholes if as_group else match.pairs
-        pair = int(match.whole_of[unit] if as_group else match.pair_of[k] if itself else nearest[k])
-        face = int(shown.overlaps.second[pair]) if pair >= 0 else -1
-        model = int(match.made.owner[face]) if face >= 0 else -1
-        rows.append(
-            ReferenceFace(
-                building=owner,
-                building_id=reference.buildings[owner].building_id,
-                plane_id=surface.plane_id,
-                group=surface.group,
-                unit=unit,
-                area_m2=float(area[k]),
-                slope_deg=float(slope[k]),
-                n_points=int(points[k]),
-                unit_area_m2=float(unit_m2[unit]),
-                to_be_found=bool(to_be_found[unit]),
-                found=bool(match.found[unit]),
-                matched=as_group or itself,
-                as_group=as_group,
-                model=model,
-                model_id=models[model].building_id if model >= 0 else None,
-                model_plane_id=planes[face] if face >= 0 else -1,
-                overlap_reference=float(shown.share_true[pair]) if face >= 0 else 0.0,
-                overlap_model=float(shown.share_model[pair]) if face >= 0 else 0.0,
-                angle_deg=float(shown.angle_deg[pair]) if face >= 0 else math.nan,
-                offset_m=float(shown.offset_m[pair]) if face >= 0 else math.nan,
-                topology=topology[unit],
-            )
-        )
-    return tuple(rows)
-
-
-def _model_rows(
-    models: Sequence[RoofModel],
-    match: FaceMatch,
-    building: IntArray,
-    verdicts: Sequence[FaceVerdict],
-    topology: Sequence[Topology | None],
-) -> tuple[ModelFace, ...]:
-    area, slope = match.made.area_m2, match.made.slope_deg
-    surfaces = [surface for model in models for surface in model.surfaces]
-    return tuple(
-        ModelFace(
-            model=int(match.made.owner[k]),
-            model_id=models[match.made.owner[k]].building_id,
-            plane_id=surface.plane_id,
-            area_m2=float(area[k]),
-            slope_deg=float(slope[k]),
-            building=int(building[k]),
-            matched=bool(match.matched_unit[k] >= 0),
-            unit=int(match.matched_unit[k]),
-            verdict=verdicts[k],
-            topology=topology[k],
-        )
-        for k, surface in enumerate(surfaces)
-    )
-
-
 def measures(score: FaceScore, subset: Subset) -> list[Measure]:
     """The figures of one subset of the buildings; none without true faces.
 
     Model faces on no reference building count in the subset `all` only.
     """
-    if not score.reference:
+    if not score.true or not len(score.true["unit"]):
         return []
-    columns, n = _columns(score, subset)
-    found = []
+    columns = _columns(score, subset)
+    n = {name: float(columns[name].sum()) for name in ("large", "true", "made", "components")}
+    figures: list[tuple[str, Statistic, float]] = []
     for suffix, true in (("10m2", "large"), ("all", "true")):
-        both, wrong = f"found_{true}", f"wrong_{true}"
-        columns[f"made_{suffix}"] = columns[both] + columns[wrong]
-        made = float(columns[f"made_{suffix}"].sum())
+        both, wrong, made = f"found_{true}", f"wrong_{true}", f"made_{suffix}"
+        columns[made] = columns[both] + columns[wrong]
         union = n[true] + float(columns[wrong].sum())
-        found += [
-            measured(f"faces.completeness_{suffix}", columns, share(both, true), n=n[true], subset=subset),
-            measured(f"faces.correctness_{suffix}", columns, share(both, f"made_{suffix}"), n=made, subset=subset),
-            measured(f"faces.quality_{suffix}", columns, quality(both, true, f"made_{suffix}"), n=union, subset=subset),
+        figures += [
+            (f"faces.completeness_{suffix}", share(both, true), n[true]),
+            (f"faces.correctness_{suffix}", share(both, made), float(columns[made].sum())),
+            (f"faces.quality_{suffix}", quality(both, true, made), union),
         ]
-    found += [
-        measured("faces.completeness_area", columns, share("found_m2", "true_m2"), n=n["true"], subset=subset),
-        measured("faces.correctness_area", columns, share("right_m2", "made_m2"), n=n["made"], subset=subset),
-        measured(
-            "faces.quality_area",
-            columns,
-            Share(figure=_quality_by_area, denominator="true_m2"),
-            n=n["true"] + n["made"],
-            subset=subset,
-        ),
+    figures += [
+        ("faces.completeness_area", share("found_m2", "true_m2"), n["true"]),
+        ("faces.correctness_area", share("right_m2", "made_m2"), n["made"]),
+        ("faces.quality_area", Share(figure=_quality_by_area, denominator="true_m2"), n["true"] + n["made"]),
+        *((TOPOLOGY_NAMES[kind], total(kind.value), n["components"]) for kind in Topology),
     ]
-    for kind in Topology:
-        found.append(measured(TOPOLOGY_NAMES[kind], columns, total(kind.value), n=n["components"], subset=subset))
-    return found
+    return measured_all(columns, subset, figures)
 
 
-def _columns(score: FaceScore, subset: Subset) -> tuple[dict[str, FloatArray], dict[str, float]]:
-    """Sums over the units of the bootstrap, and counts of the subset."""
-    units = list({row.unit: row for row in reversed(score.reference)}.values())
-    true = {
-        "large": [row.to_be_found for row in units],
-        "found_large": [row.to_be_found and row.found for row in units],
-        "true": [True for _ in units],
-        "found_true": [row.found for row in units],
-        "true_m2": [row.unit_area_m2 for row in units],
-        "found_m2": [row.unit_area_m2 if row.found else 0.0 for row in units],
-    }
-    judged = [row for row in score.models if row.verdict is not FaceVerdict.LEFT_OUT]
-    made = {
-        "wrong_large": [row.verdict is FaceVerdict.WRONG for row in judged],
-        "wrong_true": [not row.matched for row in judged],
-        "made_m2": [row.area_m2 for row in judged],
-        "right_m2": [row.area_m2 if row.matched else 0.0 for row in judged],
-        "made": [True for _ in judged],
-    }
-    parts = {kind.value: [row.kind is kind for row in score.components] for kind in Topology}
-    parts["components"] = [True for _ in score.components]
-    tables = (true, made, parts)
-    lengths = [len(units), len(judged), len(score.components)]
-    building = [row.building for row in units] + [row.building for row in judged]
-    building += [row.building for row in score.components]
-    model = [0] * len(units) + [row.model for row in judged] + [row.model for row in score.components]
-    columns = {
-        name: np.concatenate(
-            [
-                np.asarray(values, np.float64) if other is table else np.zeros(length)
-                for other, length in zip(tables, lengths, strict=True)
-            ]
-        )
-        for table in tables
-        for name, values in table.items()
-    }
-    summed = summed_over_units(subset, np.array(building, np.int64), np.array(model, np.int64), columns)
-    return summed, {name: float(summed[name].sum()) for name in ("large", "true", "made", "components")}
+def _columns(score: FaceScore, subset: Subset) -> dict[str, FloatArray]:
+    """Sums over the units of the bootstrap."""
+    # One row per unit: its first face, in the order of the last faces from the end.
+    first = np.unique(score.true["unit"], return_index=True)[1]
+    last = np.unique(score.true["unit"][::-1], return_index=True)[1]
+    true = {name: column[first[np.argsort(last)]] for name, column in score.true.items()}
+    judged = score.made["verdict"] != FaceVerdict.LEFT_OUT
+    made = {name: column[judged] for name, column in score.made.items()}
+    parts = score.components
+    sums: Sequence[tuple[Columns, Columns]] = (
+        (
+            true,
+            {
+                "large": true["to_be_found"],
+                "found_large": true["to_be_found"] & true["found"],
+                "true": np.ones_like(true["found"]),
+                "found_true": true["found"],
+                "true_m2": true["unit_area_m2"],
+                "found_m2": np.where(true["found"], true["unit_area_m2"], 0.0),
+            },
+        ),
+        (
+            made,
+            {
+                "wrong_large": made["verdict"] == FaceVerdict.WRONG,
+                "wrong_true": ~made["found"],
+                "made_m2": made["area_m2"],
+                "right_m2": np.where(made["found"], made["area_m2"], 0.0),
+                "made": np.ones_like(made["found"]),
+            },
+        ),
+        (
+            parts,
+            {kind.value: parts["kind"] == kind for kind in Topology} | {"components": np.ones(len(parts["kind"]))},
+        ),
+    )
+    lengths = [len(rows["building"]) for rows, _ in sums]
+    building = np.concatenate([rows["building"] for rows, _ in sums])
+    model = np.concatenate([np.zeros(lengths[0], np.int64), made["model"], parts["model"]])
+    starts = np.concatenate([[0], np.cumsum(lengths)])
+    columns = {}
+    for number, (_, values) in enumerate(sums):
+        for name, column in values.items():
+            columns[name] = np.zeros(len(building))
+            columns[name][starts[number] : starts[number + 1]] = column
+    return summed_over_units(subset, building, model, columns)
 
 
 def _quality_by_area(sums: Sums) -> FloatArray:

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import dataclasses
-import math
 from collections.abc import Sequence
 
 import numpy as np
 import shapely
 
-from pipeline.model import FloatArray
 from pipeline.ruler.evaluation.bootstrap import ratio, share
 from pipeline.ruler.evaluation.matching import MIN_SHARE, Geometries, Matching, sound_polygons
 from pipeline.ruler.evaluation.measure import Better, Measure, defined
 from pipeline.ruler.evaluation.models import RoofModel
 from pipeline.ruler.evaluation.reference import Reference
-from pipeline.ruler.evaluation.subsets import Subset, measured, measured_median
+from pipeline.ruler.evaluation.subsets import Columns, Subset, measured, measured_all, measured_median
 
 LIMITS = (0.5, 0.8, 0.9)
 """Limits of the shares of buildings by IoU."""
@@ -23,68 +20,36 @@ _ROUNDING = 1e-9
 """Numerical guard for comparisons of shares."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class FootprintRow:
-    """One reference building."""
+def score_footprints(models: Sequence[RoofModel], reference: Reference, matching: Matching) -> Columns:
+    """Columns of the reference buildings in their order.
 
-    building: int
-    """Its index."""
-    building_id: str
-    """Its name."""
-    model: int
-    """Index of the model that stands for it; -1 if it was not found."""
-    model_id: str | None
-    """Name of that model."""
-    iou: float
-    """Intersection over union with that model; 0 if it was not found."""
-    iou_together: float
-    """The same with the union of all models that share at least half of either with it; 0 without any."""
-    models_over: int
-    """Number of those models."""
-    area_m2: float
-    """Area of the reference footprint."""
-    model_area_m2: float
-    """Area of the model that stands for it; nan if it was not found."""
-    area_bias: float
-    """Model area / reference area - 1; nan if it was not found."""
-    offset_m: float
-    """Shift of the outline that explains the difference of areas, positive outwards; nan if it was not found."""
-
-
-def score_footprints(models: Sequence[RoofModel], reference: Reference, matching: Matching) -> tuple[FootprintRow, ...]:
-    """One row per reference building, in their order.
+    `model`: index of the model that stands for it, -1 if it was not found; `model_id`; `iou` with that model, 0 without
+    one; `iou_together`: the same with the union of all models that share at least half of either with it, and
+    `models_over`, their number; `area_m2`; `area_bias`: model area / reference area - 1; `outline_offset_m`: shift of
+    the outline that explains the difference of areas, positive outwards. The last two are nan if it was not found.
 
     The offset is the difference of the areas over the mean of both perimeters. It is exact for an outline whose edges
     were all moved by one distance, since the area grows by the perimeter half way.
     """
     true = sound_polygons([building.footprint for building in reference.buildings])
     made = sound_polygons([model.footprint for model in models])
-    true_m, made_m = shapely.length(true), shapely.length(made)
-    pairs = matching.overlaps
+    pairs, model = matching.overlaps, matching.model_of
     least = np.minimum(matching.reference_m2[pairs.first], matching.model_m2[pairs.second])
     counted = pairs.common_m2 >= (MIN_SHARE - _ROUNDING) * least
-    first, second = pairs.first[counted], pairs.second[counted]
-    rows = []
-    for k, building in enumerate(reference.buildings):
-        low, high = np.searchsorted(first, [k, k + 1])
-        m = int(matching.model_of[k])
-        area, model_area = float(matching.reference_m2[k]), float(matching.model_m2[m]) if m >= 0 else math.nan
-        rows.append(
-            FootprintRow(
-                building=k,
-                building_id=building.building_id,
-                model=m,
-                model_id=models[m].building_id if m >= 0 else None,
-                iou=float(matching.iou[k]),
-                iou_together=_iou(true[k], made[second[low:high]]),
-                models_over=int(high - low),
-                area_m2=area,
-                model_area_m2=model_area,
-                area_bias=model_area / area - 1.0,
-                offset_m=2.0 * (model_area - area) / float(true_m[k] + made_m[m]) if m >= 0 else math.nan,
-            )
-        )
-    return tuple(rows)
+    ends = np.searchsorted(pairs.first[counted], np.arange(len(true) + 1))
+    over = np.split(pairs.second[counted], ends[1:-1]) if len(true) else []
+    area_m2, model_m2 = matching.reference_m2, np.append(matching.model_m2, np.nan)[model]
+    perimeters_m = shapely.length(true) + np.append(shapely.length(made), np.nan)[model]
+    return {
+        "model": model,
+        "model_id": np.array([*(one.building_id for one in models), None], object)[model],
+        "iou": matching.iou,
+        "iou_together": np.array([_iou(one, made[some]) for one, some in zip(true, over, strict=True)], np.float64),
+        "models_over": np.diff(ends),
+        "area_m2": area_m2,
+        "area_bias": model_m2 / area_m2 - 1.0,
+        "outline_offset_m": 2.0 * (model_m2 - area_m2) / perimeters_m,
+    }
 
 
 def _iou(footprint: shapely.Geometry, others: Geometries) -> float:
@@ -93,38 +58,33 @@ def _iou(footprint: shapely.Geometry, others: Geometries) -> float:
     return float(shapely.area(shapely.intersection(footprint, together)) / union) if union > 0.0 else 0.0
 
 
-def measures(rows: Sequence[FootprintRow], subset: Subset) -> list[Measure]:
+def measures(rows: Columns, subset: Subset) -> list[Measure]:
     """The figures of one subset of the buildings."""
-    counted = [row for row in rows if subset.buildings[row.building]]
-    found = [row for row in counted if row.model >= 0]
-    iou = np.array([row.iou for row in counted])
-    iou_found = np.array([row.iou for row in found])
-    figures = [
-        measured_median("footprints.iou_median", iou, subset),
-        _mean("footprints.iou_mean", iou, subset),
-        measured_median("footprints.iou_median_found", iou_found, subset),
-        _mean("footprints.iou_mean_found", iou_found, subset),
-        measured_median("footprints.iou_together_median", np.array([row.iou_together for row in counted]), subset),
-        _mean("footprints.iou_together_mean", np.array([row.iou_together for row in counted]), subset),
-        measured_median("footprints.area_bias_median", np.array([row.area_bias for row in found]), subset),
-        measured_median("footprints.offset_median", np.array([row.offset_m for row in found]), subset),
-    ]
+    found = subset.buildings & (rows["model"] >= 0)
+    figures: list[Measure] = []
+    for name, column, chosen in (
+        ("iou{}", "iou", subset.buildings),
+        ("iou{}_found", "iou", found),
+        ("iou_together{}", "iou_together", subset.buildings),
+    ):
+        values = rows[column][chosen]
+        columns = {"value": values, "count": np.ones(len(values))}
+        mean = f"footprints.{name.format('_mean')}"
+        figures += [
+            measured_median(f"footprints.{name.format('_median')}", values, subset),
+            measured(mean, columns, ratio("value", "count"), n=len(values), subset=subset),
+        ]
     figures += [
-        measured(
-            f"footprints.iou_from_{round(100 * limit)}",
-            {"reaches": (iou >= limit - _ROUNDING).astype(np.float64), "buildings": np.ones(len(iou))},
-            share("reaches", "buildings"),
-            n=len(iou),
-            subset=subset,
-        )
-        for limit in LIMITS
+        measured_median("footprints.area_bias_median", rows["area_bias"][found], subset),
+        measured_median("footprints.offset_median", rows["outline_offset_m"][found], subset),
     ]
-    return figures
-
-
-def _mean(name: str, values: FloatArray, subset: Subset) -> Measure:
-    columns = {"value": values, "count": np.ones(len(values))}
-    return measured(name, columns, ratio("value", "count"), n=len(values), subset=subset)
+    iou = rows["iou"][subset.buildings]
+    columns = {"buildings": np.ones(len(iou))}
+    columns |= {str(limit): (iou >= limit - _ROUNDING).astype(np.float64) for limit in LIMITS}
+    shares = [
+        (f"footprints.iou_from_{round(100 * limit)}", share(str(limit), "buildings"), len(iou)) for limit in LIMITS
+    ]
+    return figures + measured_all(columns, subset, shares)
 
 
 _IOU = "IoU = common area / area of the union, with the model that stands for the building"

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
@@ -24,7 +23,7 @@ from pipeline.model import BoolArray, FloatArray, IntArray
 from pipeline.ruler.evaluation.bootstrap import Statistic, Sums, share
 from pipeline.ruler.evaluation.measure import Better, Measure, defined
 from pipeline.ruler.evaluation.reference import Reference, ReferencePoints
-from pipeline.ruler.evaluation.subsets import Subset, measured
+from pipeline.ruler.evaluation.subsets import Columns, Subset, measured_all
 from pipeline.scene import GROUND_CLASS
 from pipeline.terrain.ground import Terrain, ground_of, ground_points
 from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations, lowest_per_cell
@@ -49,55 +48,20 @@ FoundGround = Callable[[ReferencePoints], BoolArray]
 """From the points of a tile to the found ground: (n,) bool, True for ground."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class GroundBlock:
-    """Judged points of one block of 50 m of one tile."""
-
-    tile: str
-    """Name of the tile."""
-    row: int
-    """Index of the block along northing, 0 at the origin of the CRS."""
-    column: int
-    """Index along easting."""
-    ground_as_ground: int
-    """Ground, found as ground."""
-    ground_as_object: int
-    """Ground, taken for an object: type I."""
-    object_as_ground: int
-    """Object, taken for ground: type II."""
-    object_as_object: int
-    """Object, found as object."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class TileGround:
-    """The figures of one tile."""
-
-    tile: str
-    """Its name."""
-    type_1: float
-    """Share of ground taken for object; nan without ground."""
-    type_2: float
-    """Share of objects taken for ground; nan without objects."""
-    total: float
-    """Share of points on the wrong side."""
-    kappa: float
-    """Cohen's kappa."""
-    ground: int
-    """Judged ground points of the reference."""
-    object: int
-    """Judged other points of the reference."""
-
-
 # ------------------------------------------------------------------------------------------------------------ counts
 
 
-def ground_blocks(reference: Reference, found: FoundGround) -> list[GroundBlock]:
-    """Count right and wrong points of every tile by blocks, one tile in memory; empty if no ground is known."""
+def ground_blocks(reference: Reference, found: FoundGround) -> Columns:
+    """Right and wrong points of every tile by blocks of 50 m, one tile in memory; empty if no ground is known.
+
+    Columns: `tile`, its name; `row` and `column` of the block, 0 at the origin of the CRS, along northing and easting;
+    `right`: ground found as ground; `missed`: ground taken for an object; `other`: object found as object; `taken`:
+    object taken for ground.
+    """
     if not reference.has_ground:
-        return []
-    rows: list[GroundBlock] = []
+        return {}
     left_out = NOT_JUDGED if reference.unclassified_is_object else (*NOT_JUDGED, *UNCLASSIFIED)
+    tiles, parts = [np.zeros(0, object)], [np.zeros((0, 6), np.int64)]
     for points in reference.points():
         labels = found(points)
         judged = points.last & ~np.isin(points.classification, left_out)
@@ -108,37 +72,24 @@ def ground_blocks(reference: Reference, found: FoundGround) -> list[GroundBlock]
         width = int(place[:, 0].max(initial=0) - west) + 1
         blocks, unit = np.unique(place[:, 1] * width + (place[:, 0] - west), return_inverse=True)
         counts = np.bincount(4 * unit + outcome, minlength=4 * len(blocks)).reshape(-1, 4)
-        rows_columns = zip((blocks // width).tolist(), (west + blocks % width).tolist(), strict=True)
-        for (row, column), (right, missed, wrong, other) in zip(
-            rows_columns, counts[:, [0, 1, 3, 2]].tolist(), strict=True
-        ):
-            rows.append(
-                GroundBlock(
-                    tile=points.name,
-                    row=row,
-                    column=column,
-                    ground_as_ground=right,
-                    ground_as_object=missed,
-                    object_as_ground=wrong,
-                    object_as_object=other,
-                )
-            )
-    return rows
+        parts.append(np.column_stack([blocks // width, west + blocks % width, counts]))
+        tiles.append(np.full(len(blocks), points.name, object))
+    names = ("row", "column", "right", "missed", "other", "taken")
+    return {"tile": np.concatenate(tiles), **dict(zip(names, np.concatenate(parts).T, strict=True))}
 
 
-def tile_figures(rows: Sequence[GroundBlock]) -> list[TileGround]:
-    """The figures of each tile, in the order of the tiles."""
-    by_tile: dict[str, list[GroundBlock]] = defaultdict(list)
-    for row in rows:
-        by_tile[row.tile].append(row)
-    found = []
-    for tile, blocks in by_tile.items():
-        columns = _columns(blocks)
-        sums = {name: column.sum(keepdims=True) for name, column in columns.items()}
-        with np.errstate(divide="ignore", invalid="ignore"):
-            figures = {name: float(statistic(sums)[0]) for name, statistic, _ in _STATISTICS}
-        found.append(TileGround(tile=tile, **figures, ground=int(sums["ground"][0]), object=int(sums["object"][0])))
-    return found
+def tile_figures(blocks: Columns) -> Columns:
+    """The figures of each tile, in the order of the tiles; nan where the tile has no ground, or no object."""
+    tiles = list(dict.fromkeys(blocks["tile"].tolist()))
+    sums: dict[str, FloatArray] = {}
+    for tile in tiles:
+        of_tile = _columns({name: column[blocks["tile"] == tile] for name, column in blocks.items()})
+        for name, column in of_tile.items():
+            sums[name] = np.append(sums.get(name, []), column.sum())
+    with np.errstate(divide="ignore", invalid="ignore"):
+        figures = {name: statistic(sums) for name, statistic, _ in _STATISTICS}
+    counts = {name: sums[name].astype(np.int64) for name in ("ground", "object")}
+    return {"tile": np.array(tiles, object), **figures, **counts}
 
 
 # ---------------------------------------------------------------------------------------------------- found in files
@@ -369,11 +320,8 @@ DEFINITIONS = tuple(
 """The measures."""
 
 
-def _columns(rows: Sequence[GroundBlock]) -> dict[str, FloatArray]:
-    counts = np.array(
-        [(r.ground_as_ground, r.ground_as_object, r.object_as_ground, r.object_as_object) for r in rows], np.float64
-    ).reshape(-1, 4)
-    right, missed, taken, other = counts.T
+def _columns(blocks: Columns) -> dict[str, FloatArray]:
+    right, missed, taken, other = (blocks[name].astype(np.float64) for name in ("right", "missed", "taken", "other"))
     return {
         "missed": missed,
         "taken": taken,
@@ -381,16 +329,14 @@ def _columns(rows: Sequence[GroundBlock]) -> dict[str, FloatArray]:
         "object": taken + other,
         "found_ground": right + taken,
         "wrong": missed + taken,
-        "all": counts.sum(axis=1),
+        "all": right + missed + taken + other,
     }
 
 
-def ground_measures(rows: Sequence[GroundBlock], subset: Subset) -> list[Measure]:
+def ground_measures(blocks: Columns, subset: Subset) -> list[Measure]:
     """The figures over all tiles, blocks of 50 m as units of the bootstrap; only for the subset `all`."""
-    if not rows or not subset.elsewhere:
+    if not blocks or not len(blocks["tile"]) or not subset.elsewhere:
         return []
-    columns = _columns(rows)
-    return [
-        measured(f"ground.{name}", columns, statistic, n=columns[denominator].sum(), subset=subset)
-        for name, statistic, denominator in _STATISTICS
-    ]
+    columns = _columns(blocks)
+    figures = ((f"ground.{name}", of, columns[denominator].sum()) for name, of, denominator in _STATISTICS)
+    return measured_all(columns, subset, figures)

@@ -14,10 +14,10 @@ import shapely
 from shapely import MultiPolygon, Polygon
 
 from pipeline.errors import InconsistentInputError, InputError, SettingsError
+from pipeline.extras.footprints.footprints_file import read_footprints
+from pipeline.extras.footprints.placed_features import off_the_data
 from pipeline.io import ReadOptions, open_source, shown
 from pipeline.io.crs import SpatialReference, with_one_vertical
-from pipeline.io.footprints import read_footprints
-from pipeline.io.placed_features import off_the_data
 from pipeline.io.places import file_at
 from pipeline.io.records import Readable
 from pipeline.io.source import Source

@@ -14,7 +14,6 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 import shapely
 from shapely import MultiPolygon, Polygon
 
@@ -26,7 +25,7 @@ from pipeline.ruler.evaluation.bootstrap import Statistic, quantile, ratio, root
 from pipeline.ruler.evaluation.measure import Better, Measure, defined
 from pipeline.ruler.evaluation.models import RoofModel
 from pipeline.ruler.evaluation.reference import Reference, ReferencePoints
-from pipeline.ruler.evaluation.subsets import Subset, measured, measured_median
+from pipeline.ruler.evaluation.subsets import Subset, measured, measured_all, measured_median
 
 TOLERANCE_M = 0.2
 """Vertical distance that still counts as right."""
@@ -41,79 +40,63 @@ EDGES_M: FloatArray = np.concatenate(
 
 _BEYOND_M = 10.0
 """Roofs farther from all reference buildings are left out of the index."""
-_COLUMNS = ("n_points", "n_covered", "n_within")
+
+
+class Tallies:
+    """Sums over vertical distances at places of roofs: measured points, or those of a lattice; one row per building."""
+
+    def __init__(self, buildings: int, edges_m: FloatArray) -> None:
+        self.edges_m = edges_m
+        """(bins + 1,) borders of the bins of the histogram."""
+        self.counts: IntArray = np.zeros((buildings, 3), np.int64)
+        """Places; those that a roof of the models covers; covered ones within the tolerance."""
+        self.sums: FloatArray = np.zeros((buildings, 2))
+        """Sum of the distances of the covered ones, and of their squares."""
+        self.histogram: LabelArray = np.zeros((buildings, len(edges_m) - 1), np.int32)
+        """The covered ones by |distance|."""
+
+    def columns(self) -> dict[str, FloatArray]:
+        """All sums by name, (buildings,) each."""
+        n_points, n_covered, n_within = self.counts.T.astype(np.float64)
+        return {
+            "n_points": n_points,
+            "n_covered": n_covered,
+            "n_within": n_within,
+            "sum_m": self.sums[:, 0],
+            "sum_squares_m2": self.sums[:, 1],
+        }
+
+    def figure(self, statistic: Statistic) -> FloatArray:
+        """A figure of each building, (buildings,); nan where it is undefined."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return statistic({**self.columns(), "histogram": self.histogram.astype(np.float64)})
+
+    def quantile(self, share: float) -> Statistic:
+        """A quantile of |distance| over the covered places, to a bin."""
+        return quantile("histogram", self.edges_m, share)
+
+
+RMSE = root_mean("sum_squares_m2", "n_covered")
+"""Root mean square of the covered places."""
+BIAS = ratio("sum_m", "n_covered")
+"""Mean of the covered places."""
+WITHIN = share("n_within", "n_points")
+"""Share of all places within the tolerance; uncovered is a miss."""
+COVERAGE = share("n_covered", "n_points")
+"""Share of all places that a roof covers."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Tally:
-    """Sums over vertical distances at places of a roof."""
+class Residuals:
+    """The residuals of roof points by reference building: point minus roof, positive if the points are above it."""
 
-    n_points: int
-    """Places, measured points or those of a lattice."""
-    n_covered: int
-    """Places that a roof of the models covers."""
-    n_within: int
-    """Covered places within 0.2 m."""
-    sum_m: float
-    """Sum of the distances of the covered ones."""
-    sum_squares_m2: float
-    """Sum of their squares."""
-    histogram: npt.NDArray[np.int32]
-    """(bins,) int32, the covered ones by |distance| over `EDGES_M` of the module."""
-
-    @property
-    def rmse_m(self) -> float:
-        """Root mean square of the covered places; nan without any."""
-        return math.sqrt(self.sum_squares_m2 / self.n_covered) if self.n_covered else math.nan
-
-    @property
-    def bias_m(self) -> float:
-        """Mean of the covered places; nan without any."""
-        return self.sum_m / self.n_covered if self.n_covered else math.nan
-
-    @property
-    def share_within(self) -> float:
-        """Share of all places within 0.2 m; uncovered is a miss; nan without places."""
-        return self.n_within / self.n_points if self.n_points else math.nan
-
-    @property
-    def coverage(self) -> float:
-        """Share of all places that a roof covers; nan without places."""
-        return self.n_covered / self.n_points if self.n_points else math.nan
-
-
-class ResidualTally(Tally):
-    """Sums over the residuals of roof points: point minus roof, positive if the points are above the roof."""
-
-    @property
-    def median_m(self) -> float:
-        """Median of |residual| of the covered points, to a bin; nan without any."""
-        return self._quantile(0.5)
-
-    @property
-    def p95_m(self) -> float:
-        """95th percentile of the same."""
-        return self._quantile(0.95)
-
-    def _quantile(self, share: float) -> float:
-        return float(quantile("h", EDGES_M, share)({"h": self.histogram[None].astype(np.float64)})[0])
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class BuildingResiduals:
-    """The residuals of one reference building."""
-
-    building: int
-    """Index into the reference's buildings."""
-    building_id: str
-    """Its name."""
-    all_points: ResidualTally
+    all_points: Tallies
     """All roof points inside the footprint."""
-    top_visible: ResidualTally
+    top_visible: Tallies
     """Top-visible points."""
-    counts: bool = True
-    """False if it touches the edge of the data: it need not be found. Outlines of the raster count all the same: in a
-    dense town they are connected, and the blocks that are cut have most of the points."""
+    counts: BoolArray
+    """(buildings,) bool, False if it touches the edge of the data: it need not be found. Outlines of the raster count
+    all the same: in a dense town they are connected, and the blocks that are cut have most of the points."""
 
 
 def top_surface_of(models: Sequence[RoofModel], *, near: Sequence[RoofModel] | None = None) -> TopSurface:
@@ -156,35 +139,31 @@ def point_residuals(points: ReferencePoints, surface: TopSurface) -> tuple[IntAr
     return index, residual
 
 
-def building_residuals(models: Sequence[RoofModel], reference: Reference) -> list[BuildingResiduals]:
+def building_residuals(models: Sequence[RoofModel], reference: Reference) -> Residuals:
     """The residuals of every reference building: one pass over the points, one tile in memory.
 
     Buildings in several tiles add up. All tiles near a point decide whether it is top-visible, if the reference knows
     the bounds of the tiles.
     """
     surface = top_surface_of(models, near=reference.buildings)
-    everything, visible = _Tallies(len(reference.buildings)), _Tallies(len(reference.buildings))
+    everything, visible = (Tallies(len(reference.buildings), EDGES_M) for _ in range(2))
     seam = _Seam(reference.bounds)
+
+    def add(tallies: Tallies, building: LabelArray, residual: FloatArray) -> None:
+        _tally(building, residual, EDGES_M, TOLERANCE_M, tallies.counts, tallies.sums, tallies.histogram)
+
     for number, points in enumerate(reference.points()):
         index, residual = point_residuals(points, surface)
         xyz, building = points.xyz[index], points.building[index]
-        everything.add(building, residual)
+        add(everything, building, residual)
         judged = seam.judged_here(number, xyz, building, residual)
         sees_sky = _top_visible_by_building(xyz, building) & judged
-        visible.add(building[sees_sky], residual[sees_sky])
+        add(visible, building[sees_sky], residual[sees_sky])
     xyz, building, residual, judged = seam.points()
     sees_sky = _top_visible_by_building(xyz, building) & judged
-    visible.add(building[sees_sky], residual[sees_sky])
-    return [
-        BuildingResiduals(
-            building=number,
-            building_id=model.building_id,
-            all_points=everything.tally(number),
-            top_visible=visible.tally(number),
-            counts=reference.outlines == "raster" or not model.touches_data_edge,
-        )
-        for number, model in enumerate(reference.buildings)
-    ]
+    add(visible, building[sees_sky], residual[sees_sky])
+    cut = np.array([model.touches_data_edge for model in reference.buildings], np.bool_)
+    return Residuals(all_points=everything, top_visible=visible, counts=~cut | (reference.outlines == "raster"))
 
 
 def _top_visible_by_building(xyz: FloatArray, building: LabelArray) -> BoolArray:
@@ -228,32 +207,6 @@ class _Seam:
         kept = [empty, *self._kept]
         xyz, building, residual, judged = (np.concatenate(column) for column in zip(*kept, strict=True))
         return xyz, building, residual, judged
-
-
-class _Tallies:
-    """Sums of all buildings."""
-
-    def __init__(self, n: int) -> None:
-        self._counts = np.zeros((n, len(_COLUMNS)), np.int64)
-        self._sums = np.zeros((n, 2))
-        self._histogram = np.zeros((n, len(EDGES_M) - 1), np.int32)
-
-    def add(self, building: LabelArray, residual: FloatArray) -> None:
-        """Count points with a building."""
-        _tally(building, residual, EDGES_M, TOLERANCE_M, self._counts, self._sums, self._histogram)
-
-    def tally(self, number: int) -> ResidualTally:
-        """The sums of one building."""
-        n_points, n_covered, n_within = self._counts[number].tolist()
-        total, squares = self._sums[number].tolist()
-        return ResidualTally(
-            n_points=n_points,
-            n_covered=n_covered,
-            n_within=n_within,
-            sum_m=total,
-            sum_squares_m2=squares,
-            histogram=self._histogram[number],
-        )
 
 
 @kernel
@@ -325,36 +278,30 @@ DEFINITIONS = (
 """The measures."""
 
 
-def residual_measures(rows: Sequence[BuildingResiduals], subset: Subset) -> list[Measure]:
+def residual_measures(rows: Residuals | None, subset: Subset) -> list[Measure]:
     """The figures of a subset, buildings as units of the bootstrap; empty without points."""
-    if not any(row.all_points.n_points for row in rows):
+    if rows is None or not rows.all_points.counts[:, 0].any():
         return []
-    counted = [row for row in rows if (row.counts if subset.elsewhere else subset.buildings[row.building])]
+    counted = rows.counts if subset.elsewhere else subset.buildings
     found: list[Measure] = []
     for suffix in _SUFFIXES:
-        tallies = [row.top_visible if suffix else row.all_points for row in counted]
-        columns: dict[str, FloatArray] = {
-            name: np.array([getattr(tally, name) for tally in tallies], np.float64)
-            for name in (*_COLUMNS, "sum_m", "sum_squares_m2")
-        }
+        tallies = rows.top_visible if suffix else rows.all_points
+        columns: dict[str, FloatArray] = {name: column[counted] for name, column in tallies.columns().items()}
+        columns["histogram"] = tallies.histogram[counted].astype(np.float64)
         n_points, n_covered = columns["n_points"].sum(), columns["n_covered"].sum()
-        histogram = np.array([tally.histogram for tally in tallies], np.float64).reshape(-1, len(EDGES_M) - 1)
-        figures: tuple[tuple[str, dict[str, FloatArray], Statistic, float], ...] = (
-            ("within_0_2m", columns, share("n_within", "n_points"), n_points),
-            ("coverage", columns, share("n_covered", "n_points"), n_points),
-            ("rmse", columns, root_mean("sum_squares_m2", "n_covered"), n_covered),
-            ("median", {"h": histogram}, quantile("h", EDGES_M, 0.5), n_covered),
-            ("p95", {"h": histogram}, quantile("h", EDGES_M, 0.95), n_covered),
-            ("bias", columns, ratio("sum_m", "n_covered"), n_covered),
+        figures = (
+            ("within_0_2m", WITHIN, n_points),
+            ("coverage", COVERAGE, n_points),
+            ("rmse", RMSE, n_covered),
+            ("median", tallies.quantile(0.5), n_covered),
+            ("p95", tallies.quantile(0.95), n_covered),
+            ("bias", BIAS, n_covered),
         )
-        found += [
-            measured(f"residuals.{name}{suffix}", used, statistic, n=n, subset=subset)
-            for name, used, statistic, n in figures
-        ]
-        rmse = np.array([tally.rmse_m for tally in tallies if tally.n_covered])
-        found.append(measured_median(f"residuals.building_rmse{suffix}", rmse, subset))
-    everything = np.array([row.all_points.n_points for row in counted], np.float64)
-    below = {"n_points": everything, "n_below": everything - [row.top_visible.n_points for row in counted]}
+        found += measured_all(columns, subset, ((f"residuals.{name}{suffix}", of, n) for name, of, n in figures))
+        rmse = tallies.figure(RMSE)[counted]
+        found.append(measured_median(f"residuals.building_rmse{suffix}", rmse[np.isfinite(rmse)], subset))
+    everything, visible = (one.counts[counted, 0].astype(np.float64) for one in (rows.all_points, rows.top_visible))
+    below = {"n_points": everything, "n_below": everything - visible}
     statistic = share("n_below", "n_points")
     found.append(measured("residuals.below_roof", below, statistic, n=everything.sum(), subset=subset))
     return found

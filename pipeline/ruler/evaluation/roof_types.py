@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-import dataclasses
+from collections import Counter
 from collections.abc import Sequence
 from enum import StrEnum
+from typing import Any
 
 import numpy as np
 
-from pipeline.model import FloatArray, RoofType
+from pipeline.model import BoolArray, FloatArray, RoofType
 from pipeline.ruler.evaluation.bootstrap import Sums, share
 from pipeline.ruler.evaluation.faces import FaceScore, FaceVerdict
 from pipeline.ruler.evaluation.matching import Matching
 from pipeline.ruler.evaluation.measure import Better, Measure, defined
 from pipeline.ruler.evaluation.models import RoofModel
 from pipeline.ruler.evaluation.reference import Reference
-from pipeline.ruler.evaluation.subsets import Subset, measured
+from pipeline.ruler.evaluation.subsets import Columns, Subset, measured_all
 
 _TYPES = tuple(RoofType)
 _PAPER_TYPES = (RoofType.FLAT, RoofType.PENT, RoofType.GABLE, RoofType.HIP, RoofType.COMBINATION)
@@ -32,99 +33,45 @@ class Outcome(StrEnum):
     """The rest."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class RoofTypeRow:
-    """One reference building."""
-
-    building: int
-    """Its index."""
-    building_id: str
-    """Its name."""
-    shape: str | None
-    """Parametric shape, where conditions are known."""
-    true_type: RoofType
-    """Its roof type."""
-    model: int
-    """Index of the model that stands for it; -1 for none."""
-    model_type: RoofType
-    """Roof type of that model; none without a model."""
-    faces_to_find: int
-    """Its faces to be found, groups as one."""
-    faces_found: int
-    """Found ones of these."""
-    wrong_faces: int
-    """Model faces of at least 10 m2 that match nothing and lie most on it."""
-    outcome: Outcome
-    """The paper's verdict."""
-
-    @property
-    def type_right(self) -> bool:
-        """Whether a model stands for it and says the right type."""
-        return self.model >= 0 and self.true_type == self.model_type
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class OutcomeRow:
-    """One row of the paper's tables."""
-
-    subset: str
-    """all, good or hard."""
-    kind: str
-    """type or shape: what `name` is."""
-    name: str
-    """A roof type or shape; all."""
-    correct: int
-    """Buildings."""
-    passable: int
-    """Buildings."""
-    false: int
-    """Buildings."""
-
-    @property
-    def total(self) -> int:
-        """All of the row."""
-        return self.correct + self.passable + self.false
-
-
 def score_roof_types(
     models: Sequence[RoofModel], reference: Reference, matching: Matching, faces: FaceScore
-) -> tuple[RoofTypeRow, ...]:
-    """One row per reference building, in their order; none against a reference without faces.
+) -> Columns:
+    """Columns of the reference buildings in their order; empty against a reference without faces.
 
-    A building without faces to be found is correct if its type is right and no face is wrong, else false.
+    `shape`, where conditions are known; `true_type`; `model`: index of the model that stands for it, -1 for none;
+    `model_type`: its roof type, none without a model; `faces_to_find` and `faces_found` of these, groups as one;
+    `faces_wrong`: model faces of at least 10 m2 that match nothing and lie most on it; `outcome`. A building without
+    faces to be found is correct if its type is right and no face is wrong, else false.
     """
     if not reference.has_faces:
-        return ()
-    count = len(reference.buildings)
-    wanted, found, wrong = np.zeros(count, np.int64), np.zeros(count, np.int64), np.zeros(count, np.int64)
-    for row in {row.unit: row for row in faces.reference}.values():
-        wanted[row.building] += row.to_be_found
-        found[row.building] += row.to_be_found and row.found
-    for face in faces.models:
-        if face.verdict is FaceVerdict.WRONG and face.building >= 0:
-            wrong[face.building] += 1
-    rows = []
-    for k, building in enumerate(reference.buildings):
-        m = int(matching.model_of[k])
-        model_type = models[m].roof_type if m >= 0 else RoofType.NONE
-        conditions = reference.conditions.get(building.building_id)
-        rows.append(
-            RoofTypeRow(
-                building=k,
-                building_id=building.building_id,
-                shape=conditions.shape if conditions else None,
-                true_type=building.roof_type,
-                model=m,
-                model_type=model_type,
-                faces_to_find=int(wanted[k]),
-                faces_found=int(found[k]),
-                wrong_faces=int(wrong[k]),
-                outcome=outcome(
-                    int(wanted[k]), int(found[k]), int(wrong[k]), type_right=m >= 0 and model_type == building.roof_type
-                ),
-            )
-        )
-    return tuple(rows)
+        return {}
+    count, model = len(reference.buildings), matching.model_of
+    true_type = np.array([building.roof_type for building in reference.buildings], object)
+    model_type = np.array([*(one.roof_type for one in models), RoofType.NONE], object)[model]
+    first = np.unique(faces.true["unit"], return_index=True)[1]
+    of_unit, wanted = faces.true["building"][first], faces.true["to_be_found"][first]
+    wrong = (faces.made["verdict"] == FaceVerdict.WRONG) & (faces.made["building"] >= 0)
+    known = [reference.conditions.get(building.building_id) for building in reference.buildings]
+    counts = {
+        "faces_to_find": np.bincount(of_unit[wanted], minlength=count),
+        "faces_found": np.bincount(of_unit[wanted & faces.true["found"][first]], minlength=count),
+        "faces_wrong": np.bincount(faces.made["building"][wrong], minlength=count),
+    }
+    type_right = (model >= 0) & (true_type == model_type)
+    return {
+        "shape": np.array([one.shape if one else None for one in known], object),
+        "true_type": true_type,
+        "model": model,
+        "model_type": model_type,
+        **counts,
+        "outcome": np.array(
+            [
+                outcome(*numbers, type_right=right)
+                for *numbers, right in zip(*(column.tolist() for column in (*counts.values(), type_right)), strict=True)
+            ],
+            object,
+        ),
+    }
 
 
 def outcome(faces_to_find: int, faces_found: int, wrong_faces: int, *, type_right: bool) -> Outcome:
@@ -138,61 +85,53 @@ def outcome(faces_to_find: int, faces_found: int, wrong_faces: int, *, type_righ
     return Outcome.PASSABLE if 0 < faces_to_find <= 2 * faces_found else Outcome.FALSE
 
 
-def confusion(rows: Sequence[RoofTypeRow], subset: Subset) -> dict[tuple[RoofType, RoofType], int]:
+def confusion(rows: Columns, subset: Subset) -> dict[tuple[RoofType, RoofType], int]:
     """Buildings by true type and the model's type (none where not found), in the order of the types."""
-    counts: dict[tuple[RoofType, RoofType], int] = {}
-    for row in rows:
-        if subset.buildings[row.building]:
-            pair = row.true_type, row.model_type
-            counts[pair] = counts.get(pair, 0) + 1
+    counts = Counter(zip(rows["true_type"][subset.buildings], rows["model_type"][subset.buildings], strict=True))
     return {(t, m): counts[t, m] for t in _TYPES for m in _TYPES if (t, m) in counts}
 
 
-def outcome_table(rows: Sequence[RoofTypeRow], subset: Subset) -> tuple[OutcomeRow, ...]:
-    """The table of the paper for a subset: one row per true type, one for all, then one per known shape.
+def outcome_tables(rows: Columns, subset: Subset) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """The table of the paper for a subset: one row per true type and one for all; and one row per known shape.
 
     The five types of the paper always have a row, others only with buildings.
     """
-    counted = [row for row in rows if subset.buildings[row.building]]
-    others = [kind for kind in _TYPES if kind not in _PAPER_TYPES and any(row.true_type is kind for row in counted)]
-    table = [
-        _outcomes(subset, "type", kind.value, [row for row in counted if row.true_type is kind])
-        for kind in (*_PAPER_TYPES, *others)
-    ]
-    table.append(_outcomes(subset, "type", "all", counted))
-    shapes = sorted({row.shape for row in counted if row.shape is not None})
-    table += [_outcomes(subset, "shape", shape, [row for row in counted if row.shape == shape]) for shape in shapes]
-    return tuple(table)
+    counted = {name: column[subset.buildings] for name, column in rows.items()}
+
+    def row(key: str, name: str, chosen: BoolArray) -> dict[str, Any]:
+        counts = {one.value: int((counted["outcome"][chosen] == one).sum()) for one in Outcome}
+        return {"subset": subset.name, key: name, **counts}
+
+    found = set(counted["true_type"])
+    kinds = (*_PAPER_TYPES, *(kind for kind in _TYPES if kind in found and kind not in _PAPER_TYPES))
+    by_type = [row("true_type", kind.value, counted["true_type"] == kind) for kind in kinds]
+    by_type.append(row("true_type", "all", np.ones(len(counted["model"]), np.bool_)))
+    shapes = sorted({shape for shape in counted["shape"] if shape is not None})
+    return by_type, [row("shape", shape, counted["shape"] == shape) for shape in shapes]
 
 
-def _outcomes(subset: Subset, kind: str, name: str, rows: Sequence[RoofTypeRow]) -> OutcomeRow:
-    correct, passable, false = (sum(row.outcome is one for row in rows) for one in Outcome)
-    return OutcomeRow(subset=subset.name, kind=kind, name=name, correct=correct, passable=passable, false=false)
-
-
-def measures(rows: Sequence[RoofTypeRow], subset: Subset) -> list[Measure]:
+def measures(rows: Columns, subset: Subset) -> list[Measure]:
     """The figures of one subset of the buildings; none without rows."""
-    if not rows:
+    if not rows or not len(rows["model"]):
         return []
-    counted = [row for row in rows if subset.buildings[row.building]]
-    columns: dict[str, FloatArray] = {"buildings": np.ones(len(counted))}
-    columns |= {one.value: np.array([row.outcome is one for row in counted], np.float64) for one in Outcome}
-    columns["right"] = np.array([row.type_right for row in counted], np.float64)
-    columns["modelled"] = np.array([row.model >= 0 for row in counted], np.float64)
-    pairs = np.zeros((len(counted), len(_TYPES) ** 2))
-    for place, row in enumerate(counted):
-        pairs[place, _TYPES.index(row.true_type) * len(_TYPES) + _TYPES.index(row.model_type)] = 1.0
-    columns["pairs"] = pairs
-    n, found = len(counted), float(columns["modelled"].sum())
-    return [
-        *(
-            measured(f"roof_types.{one.value}", columns, share(one.value, "buildings"), n=n, subset=subset)
-            for one in Outcome
-        ),
-        measured("roof_types.accuracy", columns, share("right", "buildings"), n=n, subset=subset),
-        measured("roof_types.accuracy_found", columns, share("right", "modelled"), n=found, subset=subset),
-        measured("roof_types.kappa", columns, _kappa, n=n, subset=subset),
-    ]
+    counted = {name: column[subset.buildings] for name, column in rows.items()}
+    n, model = len(counted["model"]), counted["model"] >= 0
+    columns: dict[str, FloatArray] = {"buildings": np.ones(n), "modelled": model.astype(np.float64)}
+    columns |= {one.value: (counted["outcome"] == one).astype(np.float64) for one in Outcome}
+    columns["right"] = (model & (counted["true_type"] == counted["model_type"])).astype(np.float64)
+    places = [[_TYPES.index(kind) for kind in counted[name]] for name in ("true_type", "model_type")]
+    columns["pairs"] = np.zeros((n, len(_TYPES) ** 2))
+    columns["pairs"][np.arange(n), np.array(places[0], int) * len(_TYPES) + np.array(places[1], int)] = 1.0
+    return measured_all(
+        columns,
+        subset,
+        [
+            *((f"roof_types.{one}", share(one.value, "buildings"), n) for one in Outcome),
+            ("roof_types.accuracy", share("right", "buildings"), n),
+            ("roof_types.accuracy_found", share("right", "modelled"), float(model.sum())),
+            ("roof_types.kappa", _kappa, n),
+        ],
+    )
 
 
 def _kappa(sums: Sums) -> FloatArray:

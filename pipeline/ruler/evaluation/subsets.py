@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from pipeline.model import BoolArray, FloatArray, IntArray
 from pipeline.ruler.evaluation.bootstrap import CONFIDENCE, DRAWS, Statistic, Sums, bootstrap
@@ -14,6 +16,8 @@ from pipeline.ruler.evaluation.matching import summed
 from pipeline.ruler.evaluation.measure import Measure
 from pipeline.ruler.evaluation.reference import Reference
 
+Columns = dict[str, npt.NDArray[Any]]
+"""Columns of one length by name: one row per building, model, face or block."""
 _SEED = 20_090_402
 _VALUES_A_BLOCK = 1_000_000
 
@@ -97,6 +101,13 @@ def measured(
     )
 
 
+def measured_all(
+    columns: Mapping[str, FloatArray], subset: Subset, figures: Iterable[tuple[str, Statistic, float]]
+) -> list[Measure]:
+    """Figures of the same units: name, statistic and denominator of each."""
+    return [measured(name, columns, statistic, n=n, subset=subset) for name, statistic, n in figures]
+
+
 def measured_median(name: str, values: FloatArray, subset: Subset) -> Measure:
     """The median over buildings with its percentile interval: one finite value (n,) per unit, so the units are redrawn.
 
@@ -135,8 +146,4 @@ class _LookedAt(dict[str, FloatArray]):
 
 def total(column: str) -> Statistic:
     """The sum of a column: counts."""
-
-    def statistic(sums: Sums) -> FloatArray:
-        return sums[column]
-
-    return statistic
+    return lambda sums: sums[column]

@@ -7,18 +7,18 @@ true roof that no model covers is a miss.
 from __future__ import annotations
 
 import dataclasses
-import math
+import itertools
 from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from pipeline.model import FloatArray, IntArray
-from pipeline.ruler.evaluation.bootstrap import quantile, ratio, root_mean, share
+from pipeline.ruler.evaluation.bootstrap import ratio
 from pipeline.ruler.evaluation.measure import Better, Measure, defined
 from pipeline.ruler.evaluation.models import RoofModel
 from pipeline.ruler.evaluation.reference import Reference
-from pipeline.ruler.evaluation.residuals import Tally, top_surface_of
-from pipeline.ruler.evaluation.subsets import Subset, measured
+from pipeline.ruler.evaluation.residuals import BIAS, COVERAGE, RMSE, WITHIN, Tallies, top_surface_of
+from pipeline.ruler.evaluation.subsets import Subset, measured_all
 
 SAMPLE_M = 0.25
 """Spacing of the lattice."""
@@ -42,40 +42,45 @@ _PLACES_A_BATCH = 2_000_000
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class SurfaceRow(Tally):
-    """One reference building: lattice places on its true roof; distances are models minus truth."""
+class SurfaceScore:
+    """Distances, models minus truth, at lattice places on the true roof of each reference building."""
 
-    building: int
-    """Its index."""
-    building_id: str
-    """Its name."""
-    median_m: float
-    """Median of the absolute distances where covered; nan without any."""
+    tallies: Tallies
+    """Their sums."""
+    median_m: FloatArray
+    """(buildings,) median of the absolute distances where covered; nan without any."""
 
 
 def score_surface(
     models: Sequence[RoofModel], reference: Reference, *, sample_m: float = SAMPLE_M
-) -> tuple[SurfaceRow, ...]:
-    """One row per reference building, in their order; none against a reference without faces.
+) -> SurfaceScore | None:
+    """The differences of all reference buildings; None against a reference without faces.
 
     The lattice has its places at odd multiples of half of `sample_m`. Memory is bounded, apart from the rows.
     """
     if not reference.has_faces:
-        return ()
+        return None
     truth, made = top_surface_of(reference.buildings), top_surface_of(models, near=reference.buildings)
-    owner = np.repeat(np.arange(len(reference.buildings)), [len(one.surfaces) for one in reference.buildings])
+    count = len(reference.buildings)
+    owner = np.repeat(np.arange(count), [len(one.surfaces) for one in reference.buildings])
     owner = np.append(owner, -1)  # of face -1: none
-    rows: list[SurfaceRow] = []
+    tallies, median_m = Tallies(count, EDGES_M), np.full(count, np.nan)
     for index, x, y in _lattices(reference.buildings, sample_m):
         true_z, face = truth.at(x, y)
         own = owner[face] == index
-        building = index[own]
         difference = made.elevation(x[own], y[own]) - true_z[own]
-        first, after = len(rows), int(building[-1]) + 1 if len(building) else len(rows)
-        ends = np.searchsorted(building, np.arange(first, after + 1))
-        rows += [_row(reference, k, difference[ends[k - first] : ends[k - first + 1]]) for k in range(first, after)]
-    rows += [_row(reference, k, np.zeros(0)) for k in range(len(rows), len(reference.buildings))]
-    return tuple(rows)
+        building, starts = np.unique(index[own], return_index=True)
+        ends = itertools.pairwise([*starts.tolist(), len(difference)])
+        for number, (first, last) in zip(building.tolist(), ends, strict=True):
+            values = difference[first:last]
+            covered = values[np.isfinite(values)]
+            sizes = np.abs(covered)
+            tallies.counts[number] = len(values), len(covered), (sizes <= GOOD_M + _ROUNDING).sum()
+            tallies.sums[number] = covered.sum(), np.square(covered).sum()
+            bins = np.clip(np.searchsorted(EDGES_M, sizes, side="right") - 1, 0, len(EDGES_M) - 2)
+            tallies.histogram[number] = np.bincount(bins, minlength=len(EDGES_M) - 1)
+            median_m[number] = np.median(sizes) if len(sizes) else np.nan
+    return SurfaceScore(tallies=tallies, median_m=median_m)
 
 
 def _lattices(buildings: Sequence[RoofModel], sample_m: float) -> Iterator[tuple[IntArray, FloatArray, FloatArray]]:
@@ -111,49 +116,29 @@ def lattice_over(bounds: Sequence[tuple[float, float, float, float]], sample_m: 
     return x.ravel(), y.ravel()
 
 
-def _row(reference: Reference, building: int, difference: FloatArray) -> SurfaceRow:
-    covered = difference[np.isfinite(difference)]
-    sizes = np.abs(covered)
-    bins = np.clip(np.searchsorted(EDGES_M, sizes, side="right") - 1, 0, len(EDGES_M) - 2)
-    return SurfaceRow(
-        building=building,
-        building_id=reference.buildings[building].building_id,
-        n_points=len(difference),
-        n_covered=len(covered),
-        n_within=int((sizes <= GOOD_M + _ROUNDING).sum()),
-        sum_m=float(covered.sum()),
-        sum_squares_m2=float(np.square(covered).sum()),
-        median_m=float(np.median(sizes)) if len(sizes) else math.nan,
-        histogram=np.bincount(bins, minlength=len(EDGES_M) - 1).astype(np.int32),
-    )
-
-
-def measures(rows: Sequence[SurfaceRow], subset: Subset) -> list[Measure]:
+def measures(score: SurfaceScore | None, subset: Subset) -> list[Measure]:
     """The figures of one subset of the buildings; none without rows."""
-    if not rows:
+    if score is None or not len(score.median_m):
         return []
-    counted = [row for row in rows if subset.buildings[row.building]]
-    columns: dict[str, FloatArray] = {
-        name: np.array([getattr(row, name) for row in counted], np.float64)
-        for name in ("n_points", "n_covered", "n_within", "sum_m", "sum_squares_m2")
-    }
-    with_roof = columns["n_points"] > 0.0
-    columns["buildings"] = with_roof.astype(np.float64)
-    columns["within"] = np.divide(columns["n_within"], columns["n_points"], out=np.zeros(len(counted)), where=with_roof)
-    histogram = np.array([row.histogram for row in counted], np.float64).reshape(-1, len(EDGES_M) - 1)
+    tallies = score.tallies
+    columns: dict[str, FloatArray] = {name: one[subset.buildings] for name, one in tallies.columns().items()}
+    columns["histogram"] = tallies.histogram[subset.buildings].astype(np.float64)
+    columns["buildings"] = (columns["n_points"] > 0.0).astype(np.float64)
+    columns["within"] = np.nan_to_num(tallies.figure(WITHIN)[subset.buildings])
     places, covered = float(columns["n_points"].sum()), float(columns["n_covered"].sum())
-    bins = {"bins": histogram}
-    return [
-        measured("surface.coverage", columns, share("n_covered", "n_points"), n=places, subset=subset),
-        measured("surface.within_0_2m", columns, share("n_within", "n_points"), n=places, subset=subset),
-        measured(
-            "surface.within_0_2m_mean", columns, ratio("within", "buildings"), n=float(with_roof.sum()), subset=subset
+    return measured_all(
+        columns,
+        subset,
+        (
+            ("surface.coverage", COVERAGE, places),
+            ("surface.within_0_2m", WITHIN, places),
+            ("surface.within_0_2m_mean", ratio("within", "buildings"), float(columns["buildings"].sum())),
+            ("surface.median", tallies.quantile(0.5), covered),
+            ("surface.p95", tallies.quantile(0.95), covered),
+            ("surface.rmse", RMSE, covered),
+            ("surface.bias", BIAS, covered),
         ),
-        measured("surface.median", bins, quantile("bins", EDGES_M, 0.5), n=covered, subset=subset),
-        measured("surface.p95", bins, quantile("bins", EDGES_M, 0.95), n=covered, subset=subset),
-        measured("surface.rmse", columns, root_mean("sum_squares_m2", "n_covered"), n=covered, subset=subset),
-        measured("surface.bias", columns, ratio("sum_m", "n_covered"), n=covered, subset=subset),
-    ]
+    )
 
 
 _PLACES = f"places of a {SAMPLE_M} m lattice on the true roofs"

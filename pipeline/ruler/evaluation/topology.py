@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-import dataclasses
 from enum import StrEnum
 
 import numpy as np
+import numpy.typing as npt
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from pipeline.model import BoolArray, FloatArray, IntArray
-from pipeline.ruler.evaluation.matching import MIN_SHARE
+from pipeline.model import BoolArray, IntArray
+from pipeline.ruler.evaluation.face_matching import FaceMatch
+from pipeline.ruler.evaluation.matching import MIN_SHARE, summed
+from pipeline.ruler.evaluation.subsets import Columns
 
+Labels = npt.NDArray[np.object_]
 _ROUNDING = 1e-9
 
 
@@ -30,105 +33,62 @@ class Topology(StrEnum):
     """A model face without a true face."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class FaceComponent:
-    """Linked faces: one overlaps another by at least half of either."""
+def face_components(
+    match: FaceMatch,
+    unit_counts: BoolArray,
+    face_counts: BoolArray,
+    unit_building: IntArray,
+    face_building: IntArray,
+) -> tuple[Columns, Labels, Labels]:
+    """The connected components of linked faces: one overlaps another by at least half of either.
 
-    kind: Topology
-    """By the numbers."""
-    building: int
-    """Reference building of its first true face, else the one under most of the model face; -1 for none."""
-    model: int
-    """Model of its first model face; -1 without any."""
-    true_faces: int
-    """Number of true faces."""
-    model_faces: int
-    """Number of model faces."""
+    True faces are the units (u,) of a match. Those, and those of the model faces (m,), that count take part; `building`
+    is the reference building of each unit, and the one that most of each model face lies on, -1 for none.
 
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class TopologyInput:
-    """True faces (units u), model faces m, and pairs p that share area."""
-
-    unit: IntArray
-    """(p,) true face; a pair of a group and a model face may come in several pieces."""
-    face: IntArray
-    """(p,) model face."""
-    common_m2: FloatArray
-    """(p,) common area in plan."""
-    unit_m2: FloatArray
-    """(u,) area in plan."""
-    face_m2: FloatArray
-    """(m,) area in plan."""
-    unit_counts: BoolArray
-    """(u,) whether it takes part."""
-    face_counts: BoolArray
-    """(m,) whether it takes part."""
-    unit_building: IntArray
-    """(u,) reference building."""
-    face_building: IntArray
-    """(m,) reference building that it lies on; -1 for none."""
-    face_model: IntArray
-    """(m,) its model."""
-    face_group: IntArray
-    """(m,) a group of true faces of which it matches a piece, -1 for none: faces of one count as one."""
-
-
-Components = tuple[tuple[FaceComponent, ...], list[Topology | None], list[Topology | None]]
-
-
-def face_components(given: TopologyInput) -> Components:
-    """The connected components, and the kind of component of every unit and model face (None: takes no part)."""
-    units, faces = len(given.unit_m2), len(given.face_m2)
-    key, place = np.unique(given.unit * np.int64(max(faces, 1)) + given.face, return_inverse=True)
-    common = np.bincount(place, weights=given.common_m2, minlength=len(key))
+    Returns columns of the components: `kind`; `building` of the first true face, else of the model face; `model` of the
+    first model face, -1 without any; numbers of `true_faces` and `model_faces`. Then the kind of component of every
+    unit and of every model face, (u,) and (m,); None where it takes no part.
+    """
+    units, faces = len(match.pieces), len(match.made.owner)
+    unit_m2 = summed(match.unit, match.true.plan_m2, units)
+    key, place = np.unique(
+        match.unit[match.pairs.overlaps.first] * np.int64(max(faces, 1)) + match.pairs.overlaps.second,
+        return_inverse=True,
+    )
+    common = np.bincount(place, weights=match.pairs.overlaps.common_m2, minlength=len(key))
     unit, face = key // max(faces, 1), key % max(faces, 1)
-    least = np.minimum(given.unit_m2[unit], given.face_m2[face]) if len(key) else np.zeros(0)
-    linked = (common >= (MIN_SHARE - _ROUNDING) * least) & given.unit_counts[unit] & given.face_counts[face]
-    # Faces that match pieces of one group are one node: the first of them.
-    node = np.arange(faces)
-    grouped = np.flatnonzero((given.face_group >= 0) & given.face_counts)
-    _, first, member = np.unique(given.face_group[grouped], return_index=True, return_inverse=True)
+    least = np.minimum(unit_m2[unit], match.made.plan_m2[face]) if len(key) else np.zeros(0)
+    linked = (common >= (MIN_SHARE - _ROUNDING) * least) & unit_counts[unit] & face_counts[face]
+    # Model faces that match pieces of one group are one node: the first of them.
+    node, of_piece = np.arange(faces), match.matched_unit
+    grouped = np.flatnonzero((of_piece >= 0) & (np.append(match.pieces, 0)[of_piece] > 1) & face_counts)
+    _, first, member = np.unique(of_piece[grouped], return_index=True, return_inverse=True)
     node[grouped] = grouped[first[member]]
     edges = unit[linked], units + node[face[linked]]
     graph = coo_array((np.ones(len(edges[0])), edges), shape=(units + faces, units + faces))
     _, label = connected_components(graph, directed=False)
     of_unit, of_face = label[:units], label[units + node] if faces else np.zeros(0, label.dtype)
 
-    some_units = np.flatnonzero(given.unit_counts)
-    some_nodes = np.flatnonzero(given.face_counts & (node == np.arange(faces)))
+    some_units = np.flatnonzero(unit_counts)
+    some_nodes = np.flatnonzero(face_counts & (node == np.arange(faces)))
     count = int(label.max()) + 1 if len(label) else 0
     n_units = np.bincount(of_unit[some_units], minlength=count)
     n_faces = np.bincount(of_face[some_nodes], minlength=count)
     first_unit, first_face = np.full(count, -1), np.full(count, -1)
     first_unit[of_unit[some_units[::-1]]] = some_units[::-1]
     first_face[of_face[some_nodes[::-1]]] = some_nodes[::-1]
-    kinds: list[Topology | None] = [None] * count
-    components = []
-    for k in np.flatnonzero(n_units + n_faces).tolist():
-        u, f = int(first_unit[k]), int(first_face[k])
-        kinds[k] = _kind(int(n_units[k]), int(n_faces[k]))
-        components.append(
-            FaceComponent(
-                kind=_kind(int(n_units[k]), int(n_faces[k])),
-                building=int(given.unit_building[u] if u >= 0 else given.face_building[f]),
-                model=int(given.face_model[f]) if f >= 0 else -1,
-                true_faces=int(n_units[k]),
-                model_faces=int(n_faces[k]),
-            )
-        )
-    return (
-        tuple(components),
-        [kinds[k] if counts else None for k, counts in zip(of_unit, given.unit_counts, strict=True)],
-        [kinds[k] if counts else None for k, counts in zip(of_face, given.face_counts, strict=True)],
-    )
-
-
-def _kind(true_faces: int, model_faces: int) -> Topology:
-    if model_faces == 0:
-        return Topology.MISSED
-    if true_faces == 0:
-        return Topology.EXTRA
-    if true_faces == 1:
-        return Topology.ONE_TO_ONE if model_faces == 1 else Topology.SPLIT
-    return Topology.JOINED if model_faces == 1 else Topology.TANGLED
+    kinds = np.select(
+        [n_faces == 0, n_units == 0, (n_units == 1) & (n_faces == 1), n_units == 1, n_faces == 1],
+        [Topology.MISSED, Topology.EXTRA, Topology.ONE_TO_ONE, Topology.SPLIT, Topology.JOINED],
+        Topology.TANGLED,
+    ).astype(object)
+    held = np.flatnonzero(n_units + n_faces)
+    u, f = first_unit[held], first_face[held]
+    components = {
+        "kind": kinds[held],
+        "building": np.where(u >= 0, np.append(unit_building, -1)[u], np.append(face_building, -1)[f]),
+        "model": np.append(match.made.owner, -1)[f],
+        "true_faces": n_units[held],
+        "model_faces": n_faces[held],
+    }
+    return components, np.where(unit_counts, kinds[of_unit], None), np.where(face_counts, kinds[of_face], None)

@@ -12,41 +12,35 @@ from pipeline.ruler.evaluation.bootstrap import share
 from pipeline.ruler.evaluation.measure import Better, Measure, defined
 from pipeline.ruler.evaluation.models import ModelSet
 from pipeline.ruler.evaluation.reading.raw import is_closed
-from pipeline.ruler.evaluation.subsets import MODELS_ALONE, measured
+from pipeline.ruler.evaluation.subsets import MODELS_ALONE, measured_all
 
 NO_SOLID = "no_solid"
 """Instead of a code, for a model of surfaces alone."""
-
-SOLIDS_VALID = "validity.solids_valid"
-MODELS_VALID = "validity.models_valid"
-MODELS_CLOSED = "validity.models_closed"
-MODELS_NO_SOLID = "validity.models_no_solid"
-FAULTY_SOLIDS = "validity.faulty_solids"
-
+_SHARES = ("models_valid", "models_closed", "models_no_solid")
 
 DEFINITIONS = (
     defined(
-        SOLIDS_VALID,
+        "validity.solids_valid",
         "solids valid",
         "Solids without any code of ISO 19107 (val3dity's codes and default tolerances, vertices to 1 mm) / solids.",
     ),
     defined(
-        MODELS_VALID,
+        "validity.models_valid",
         "models with all solids valid",
         "Models with at least one solid, all of them valid / models delivered; a model of surfaces alone is not valid.",
     ),
     defined(
-        MODELS_CLOSED,
+        "validity.models_closed",
         "models with closed solids",
         "Models with at least one solid, every edge of each run both ways equally often / models delivered.",
     ),
     defined(
-        MODELS_NO_SOLID,
+        "validity.models_no_solid",
         "models without a solid",
         "Models of surfaces alone (MultiSurface, open meshes) / models delivered.",
         Better.LOWER,
     ),
-    defined(FAULTY_SOLIDS, "faulty solids", "Solids with at least one code.", Better.LOWER, "count"),
+    defined("validity.faulty_solids", "faulty solids", "Solids with at least one code.", Better.LOWER, "count"),
 )
 """The measures of this chapter."""
 
@@ -112,16 +106,15 @@ def measures(rows: Sequence[ModelValidity]) -> list[Measure]:
         "solids_valid": np.array([row.n_valid for row in rows], np.float64),
         "models_valid": np.array([row.is_valid for row in rows], np.float64),
         "models_closed": np.array([row.is_closed for row in rows], np.float64),
-        "no_solid": np.array([row.n_solids == 0 for row in rows], np.float64),
+        "models_no_solid": np.array([row.n_solids == 0 for row in rows], np.float64),
     }
     n_solids = int(columns["solids"].sum())
-    shares = (
-        (SOLIDS_VALID, "solids_valid", "solids", n_solids),
-        (MODELS_VALID, "models_valid", "models", len(rows)),
-        (MODELS_CLOSED, "models_closed", "models", len(rows)),
-        (MODELS_NO_SOLID, "no_solid", "models", len(rows)),
-    )
+    figures = [
+        ("validity.solids_valid", share("solids_valid", "solids"), n_solids),
+        *((f"validity.{name}", share(name, "models"), len(rows)) for name in _SHARES),
+    ]
+    faulty = float(n_solids - columns["solids_valid"].sum())
     return [
-        *(measured(name, columns, share(part, whole), n=n, subset=MODELS_ALONE) for name, part, whole, n in shares),
-        Measure(name=FAULTY_SOLIDS, value=float(n_solids - columns["solids_valid"].sum()), n=n_solids),
+        *measured_all(columns, MODELS_ALONE, figures),
+        Measure(name="validity.faulty_solids", value=faulty, n=n_solids),
     ]

@@ -24,11 +24,11 @@ from pipeline.ruler.evaluation.matching import (
     sound_polygons,
     where_judged,
 )
-from pipeline.ruler.evaluation.measure import Better, Definition, Group, Measure
+from pipeline.ruler.evaluation.measure import Better, Definition, Measure, defined
 from pipeline.ruler.evaluation.models import RoofModel
 from pipeline.ruler.evaluation.reading.raw import grouped
 from pipeline.ruler.evaluation.reading.wireframes import Wireframe
-from pipeline.ruler.evaluation.subsets import Subset, measured
+from pipeline.ruler.evaluation.subsets import Subset, measured, measured_all
 from pipeline.ruler.evaluation.wireframe_network import (
     MIN_TURN_DEG,
     Network,
@@ -47,50 +47,36 @@ _GAP_M = 0.5
 meet, and narrow passages between parts, are closer than a metre."""
 _ROUNDING = 1e-9
 """Numerical guard for comparisons of distances and shares."""
+_AMOUNTS = ("true_edges", "model_edges", "true_corners", "model_corners")
 _PLACES_AT_ONCE = 20_000
 """Bounds the memory of the distances."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Found:
-    """The edges or corners of one side, and how much of them the other side has at each tolerance."""
-
-    total: float
-    """Metres of edge, or number of corners."""
-    found: tuple[float, ...]
-    """The same, within each of `TOLERANCES_M` of the other side."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class WireframeRow:
-    """One true building."""
-
-    building_id: str
-    """Its name."""
-    place: tuple[float, float]
-    """x, y of its middle."""
-    model_ids: tuple[str, ...]
-    """The models that are counted for it. Empty if it has none, or shares that of a neighbour with more of it."""
-    has_model: bool
-    """True if a model stands there, be it counted for a neighbour."""
-    true_edges: Found
-    """Drawn edges, metres."""
-    model_edges: Found
-    """Edges of its models, metres."""
-    true_corners: Found
-    """Corners of the drawn edges."""
-    model_corners: Found
-    """Corners of its models."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class WireframeScore:
-    """All true buildings of a file."""
+    """All true buildings of a file, in the order of the wireframes."""
 
-    rows: tuple[WireframeRow, ...]
-    """One per building, in the order of the wireframes."""
+    building_ids: tuple[str, ...]
+    """Their names."""
+    places: FloatArray
+    """(n, 2) float64: x, y of the middle of each."""
+    model_ids: tuple[tuple[str, ...], ...]
+    """The models that are counted for each. Empty if it has none, or shares that of a neighbour with more of it."""
+    has_model: BoolArray
+    """(n,) bool, True if a model stands there, be it counted for a neighbour."""
+    amounts: Mapping[str, FloatArray]
+    """`true_edges` and `model_edges` in metres, numbers of `true_corners` and `model_corners`; (n, 1 + tolerances)
+    each: the whole amount, then what the other side has within each of `TOLERANCES_M`."""
     elsewhere: int
     """Number of models that stand on no wireframe; they are not judged."""
+
+    def columns(self, kind: str, tolerance: int) -> dict[str, FloatArray]:
+        """Amounts of a kind, edge or corner, and what is found of them within `TOLERANCES_M[tolerance]`; (n,) each."""
+        found = {}
+        for side in ("true", "model"):
+            amounts = self.amounts[f"{side}_{kind}s"]
+            found |= {side: amounts[:, 0], f"{side}_found": amounts[:, 1 + tolerance]}
+        return found
 
 
 def score_wireframes(models: Sequence[RoofModel], wireframes: Sequence[Wireframe]) -> WireframeScore:
@@ -102,30 +88,23 @@ def score_wireframes(models: Sequence[RoofModel], wireframes: Sequence[Wireframe
     places = np.array([_area_of(wireframe) for wireframe in wireframes], object)
     building, model, home = _links(models, wireframes, places)
     count = len(wireframes)
-    sides = _Sides(count)
+    amounts = {name: np.zeros((count, 1 + len(TOLERANCES_M))) for name in _AMOUNTS}
     pairs = zip(building.tolist(), (count + model).tolist(), strict=True)
     for members in grouped(count + len(models), pairs):
         true = [k for k in members if k < count]
         made = [k - count for k in members if k >= count]
         if true:
             drawn = network(joined([drawn_segments(wireframes[k], k) for k in true]))
-            sides.add(drawn, network(roof_segments([models[m] for m in made], home[made].tolist())))
-    rows = []
-    for k, wireframe in enumerate(wireframes):
-        middle = shapely.centroid(places[k])
-        rows.append(
-            WireframeRow(
-                building_id=wireframe.building_id,
-                place=(middle.x, middle.y),
-                model_ids=tuple(models[m].building_id for m in np.flatnonzero(home == k).tolist()),
-                has_model=bool((building == k).any()),
-                true_edges=sides.found("true_edges", k),
-                model_edges=sides.found("model_edges", k),
-                true_corners=sides.found("true_corners", k),
-                model_corners=sides.found("model_corners", k),
-            )
-        )
-    return WireframeScore(rows=tuple(rows), elsewhere=int((home < 0).sum()))
+            _add(amounts, drawn, network(roof_segments([models[m] for m in made], home[made].tolist())))
+    middles = [shapely.centroid(place) for place in places]
+    return WireframeScore(
+        building_ids=tuple(wireframe.building_id for wireframe in wireframes),
+        places=np.array([(middle.x, middle.y) for middle in middles]).reshape(-1, 2),
+        model_ids=tuple(tuple(models[m].building_id for m in np.flatnonzero(home == k).tolist()) for k in range(count)),
+        has_model=np.isin(np.arange(count), building),
+        amounts=amounts,
+        elsewhere=int((home < 0).sum()),
+    )
 
 
 # ------------------------------------------------------------------------------------------------- which model is where
@@ -165,31 +144,20 @@ def _links(
 # ------------------------------------------------------------------------------------------------------ both directions
 
 
-class _Sides:
-    """Totals and found amounts of all buildings, added up group by group."""
+def _add(amounts: Mapping[str, FloatArray], true: Network, made: Network) -> None:
+    """Add the amounts of one group to those of its buildings."""
 
-    def __init__(self, buildings: int) -> None:
-        names = ("true_edges", "model_edges", "true_corners", "model_corners")
-        self._sums = {name: np.zeros((buildings, 1 + len(TOLERANCES_M))) for name in names}
+    def count(name: str, owner: IntArray, amount: FloatArray, found: BoolArray) -> None:
+        np.add.at(amounts[name], owner, amount[:, None] * np.column_stack([np.ones(len(owner), np.bool_), found]))
 
-    def add(self, true: Network, made: Network) -> None:
-        """Compare the networks of one group."""
-        for name, one, other in (("true_edges", true, made), ("model_edges", made, true)):
-            places, metres, edge = sampled(one.edges)
-            found = distances(places, other.edges)[:, None] <= np.array(TOLERANCES_M) + _ROUNDING
-            self._count(name, one.edge_owner[edge], metres, found)
-        matched = [matched_corners(true.corners, made.corners, tolerance) for tolerance in TOLERANCES_M]
-        for side, name, one in ((0, "true_corners", true), (1, "model_corners", made)):
-            right = np.column_stack([pair[side] for pair in matched])
-            self._count(name, one.corner_owner, np.ones(len(one.corners)), right)
-
-    def _count(self, name: str, owner: IntArray, amount: FloatArray, found: BoolArray) -> None:
-        np.add.at(self._sums[name], owner, amount[:, None] * np.column_stack([np.ones(len(owner), np.bool_), found]))
-
-    def found(self, name: str, building: int) -> Found:
-        """The amounts of a building."""
-        total, *found = self._sums[name][building].tolist()
-        return Found(total=total, found=tuple(found))
+    for name, one, other in (("true_edges", true, made), ("model_edges", made, true)):
+        places, metres, edge = sampled(one.edges)
+        found = distances(places, other.edges)[:, None] <= np.array(TOLERANCES_M) + _ROUNDING
+        count(name, one.edge_owner[edge], metres, found)
+    matched = [matched_corners(true.corners, made.corners, tolerance) for tolerance in TOLERANCES_M]
+    for side, name, one in ((0, "true_corners", true), (1, "model_corners", made)):
+        right = np.column_stack([pair[side] for pair in matched])
+        count(name, one.corner_owner, np.ones(len(one.corners)), right)
 
 
 def sampled(edges: FloatArray) -> tuple[FloatArray, FloatArray, IntArray]:
@@ -256,21 +224,6 @@ def matched_corners(true: FloatArray, made: FloatArray, tolerance_m: float) -> t
 # -------------------------------------------------------------------------------------------------------------- figures
 
 
-def recall_precision_f1(true: Found, made: Found, tolerance: int) -> tuple[float, float, float]:
-    """The three shares of one building at `TOLERANCES_M[tolerance]`; nan where the denominator is zero."""
-    sums = {
-        "true": np.array([true.total]),
-        "true_found": np.array([true.found[tolerance]]),
-        "model": np.array([made.total]),
-        "model_found": np.array([made.found[tolerance]]),
-    }
-    with np.errstate(divide="ignore", invalid="ignore"):
-        recall, precision, f1 = (
-            float(statistic(sums)[0]) for statistic in (ratio("true_found", "true"), ratio("model_found", "model"), _f1)
-        )
-    return recall, precision, f1
-
-
 def _f1(sums: Sums) -> FloatArray:
     """Harmonic mean of recall and precision; 0 without a model."""
     recall = sums["true_found"] / sums["true"]
@@ -279,43 +232,34 @@ def _f1(sums: Sums) -> FloatArray:
     return np.where(both > 0.0, 2.0 * recall * precision / both, np.where(sums["true"] > 0.0, 0.0, np.nan))
 
 
+STATISTICS: Mapping[str, Statistic] = {
+    "recall": share("true_found", "true"),
+    "precision": share("model_found", "model"),
+    "f1": Share(figure=_f1, denominator="true"),
+}
+"""The shares at each tolerance."""
+
+
 def wireframe_measures(score: WireframeScore) -> list[Measure]:
     """The figures of all buildings; whole buildings are resampled."""
-    rows = score.rows
-    everything = Subset(name="all", buildings=np.ones(len(rows), np.bool_), elsewhere=True)
-    there = {"found": np.array([float(row.has_model) for row in rows]), "all": np.ones(len(rows))}
-    found = [measured("wireframes.with_model", there, share("found", "all"), n=len(rows), subset=everything)]
-    statistics: Mapping[str, Statistic] = {
-        "recall": share("true_found", "true"),
-        "precision": share("model_found", "model"),
-        "f1": Share(figure=_f1, denominator="true"),
-    }
+    count = len(score.building_ids)
+    everything = Subset(name="all", buildings=np.ones(count, np.bool_), elsewhere=True)
+    there = {"found": score.has_model.astype(np.float64), "all": np.ones(count)}
+    found = [measured("wireframes.with_model", there, share("found", "all"), n=count, subset=everything)]
     for kind in ("edge", "corner"):
-        true, made = ([getattr(row, f"{side}_{kind}s") for row in rows] for side in ("true", "model"))
-        columns = {"true": np.array([one.total for one in true]), "model": np.array([one.total for one in made])}
-        n = {"recall": columns["true"].sum(), "precision": columns["model"].sum()}
-        n["f1"] = n["recall"] + n["precision"]
+        true, made = (float(score.amounts[f"{side}_{kind}s"][:, 0].sum()) for side in ("true", "model"))
+        n = {"recall": true, "precision": made, "f1": true + made}
         for k, tolerance in enumerate(TOLERANCES_M):
-            columns["true_found"] = np.array([one.found[k] for one in true])
-            columns["model_found"] = np.array([one.found[k] for one in made])
-            for name, statistic in statistics.items():
-                measure = f"wireframes.{kind}_{name}_{tolerance_name(tolerance)}"
-                found.append(measured(measure, columns, statistic, n=float(n[name]), subset=everything))
-        found.append(
-            measured(f"wireframes.{kind}_ratio", columns, ratio("model", "true"), n=n["recall"], subset=everything)
-        )
+            columns, at = score.columns(kind, k), tolerance_name(tolerance)
+            figures = ((f"wireframes.{kind}_{name}_{at}", of, n[name]) for name, of in STATISTICS.items())
+            found += measured_all(columns, everything, figures)
+        found += measured_all(columns, everything, [(f"wireframes.{kind}_ratio", ratio("model", "true"), true)])
     return found
 
 
 def tolerance_name(tolerance_m: float) -> str:
     """A tolerance in the names of measures and columns: `0_5m`, `1m`."""
     return f"{tolerance_m:g}m".replace(".", "_")
-
-
-def _definition(name: str, label: str, formula: str, better: Better = Better.HIGHER, unit: str = "share") -> Definition:
-    return Definition(
-        name=f"wireframes.{name}", group=Group.WIREFRAMES, label=label, unit=unit, better=better, formula=formula
-    )
 
 
 _F1 = "2 recall precision / (recall + precision); 0 without a model"
@@ -339,22 +283,32 @@ def _definitions_at(tolerance_m: float) -> tuple[tuple[Definition, ...], tuple[D
         ("f1", "corner F1", _F1),
     )
     return (
-        tuple(_definition(f"edge_{key}_{name}", f"{label}, {at}", formula) for key, label, formula in edges),
-        tuple(_definition(f"corner_{key}_{name}", f"{label}, {at}", formula) for key, label, formula in corners),
+        tuple(defined(f"wireframes.edge_{key}_{name}", f"{label}, {at}", formula) for key, label, formula in edges),
+        tuple(defined(f"wireframes.corner_{key}_{name}", f"{label}, {at}", formula) for key, label, formula in corners),
     )
 
 
 DEFINITIONS = (
-    _definition(
-        "with_model", "wireframes with a model", "share of the wireframes where a model stands, by id or by place"
+    defined(
+        "wireframes.with_model",
+        "wireframes with a model",
+        "share of the wireframes where a model stands, by id or by place",
     ),
     *(one for tolerance in TOLERANCES_M for one in _definitions_at(tolerance)[0]),
-    _definition(
-        "edge_ratio", "length of edges, models / truth", f"model edges / true edges; {_EDGES}", Better.NEITHER, ""
+    defined(
+        "wireframes.edge_ratio",
+        "length of edges, models / truth",
+        f"model edges / true edges; {_EDGES}",
+        Better.NEITHER,
+        "",
     ),
     *(one for tolerance in TOLERANCES_M for one in _definitions_at(tolerance)[1]),
-    _definition(
-        "corner_ratio", "corners, models / truth", f"model corners / true corners; {_CORNERS}", Better.NEITHER, ""
+    defined(
+        "wireframes.corner_ratio",
+        "corners, models / truth",
+        f"model corners / true corners; {_CORNERS}",
+        Better.NEITHER,
+        "",
     ),
 )
 """The measures."""

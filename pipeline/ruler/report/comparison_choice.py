@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
-import math
 import statistics
-from collections import Counter
 from collections.abc import Sequence
+from typing import NamedTuple
 
-from pipeline.ruler.report.comparison_building import FULL_RESIDUAL_M, ComparedBuilding
+from pipeline.ruler.report.comparison_records import FULL_RESIDUAL_M, ComparedBuilding
 
 CASES = 12
 """Buildings that are drawn."""
@@ -36,24 +34,22 @@ RULE = (
 """The choice of buildings, for readers."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Choice:
+class Choice(NamedTuple):
     """A building that is drawn."""
 
     building: ComparedBuilding
-    """The building."""
     why: str
     """Reason, for readers."""
 
 
 def most_different_first(buildings: Sequence[ComparedBuilding]) -> list[ComparedBuilding]:
     """Buildings by the sum of their differences, equal ones by building_id."""
-    return sorted(buildings, key=lambda building: (-building.difference.total, building.building_id))
+    return sorted(buildings, key=lambda building: (-building.total, building.building_id))
 
 
 def chosen_buildings(buildings: Sequence[ComparedBuilding]) -> list[Choice]:
     """The buildings that are drawn, by `RULE`; independent of the order of the buildings."""
-    whole = [one for one in buildings if not any(record.touches_data_edge for record in one.records)]
+    whole = [one for one in buildings if not any(record["touches_data_edge"] for record in one.records)]
     ordered = most_different_first(whole or buildings)
     typical = _typical(ordered)
     agreeing = {choice.building.building_id for choice in typical}
@@ -64,42 +60,39 @@ def chosen_buildings(buildings: Sequence[ComparedBuilding]) -> list[Choice]:
 
 def _different(ordered: Sequence[ComparedBuilding], most: int) -> list[Choice]:
     """Buildings with the largest difference of each kind in turn; the larger total difference wins among equal ones."""
-    queues = {
-        kind: [
-            one
-            for one in sorted(ordered, key=lambda building: -getattr(building.difference, kind))
-            if getattr(one.difference, kind) > 0.0
-        ]
-        for kind in KINDS
-    }
+    queues = [
+        [Choice(one, f"differs in {label}") for one in _by(kind, ordered) if one.difference[kind] > 0.0]
+        for kind, label in KINDS.items()
+    ]
     chosen: dict[str, Choice] = {}
-    while len(chosen) < most and any(queues.values()):
-        for kind, queue in queues.items():
-            while queue and queue[0].building_id in chosen:
+    while len(chosen) < most and any(queues):
+        for queue in queues:
+            while queue and queue[0].building.building_id in chosen:
                 queue.pop(0)
             if queue and len(chosen) < most:
                 one = queue.pop(0)
-                chosen[one.building_id] = Choice(building=one, why=f"differs in {KINDS[kind]}")
+                chosen[one.building.building_id] = one
     return list(chosen.values())
+
+
+def _by(kind: str, ordered: Sequence[ComparedBuilding]) -> list[ComparedBuilding]:
+    return sorted(ordered, key=lambda building: -building.difference[kind])
 
 
 def _typical(ordered: Sequence[ComparedBuilding]) -> list[Choice]:
     """Buildings where all models have one type and number of planes: of each type in turn, the median size first."""
     agreed: dict[str, list[ComparedBuilding]] = {}
     for one in ordered:
-        apart = one.difference
-        same = not (apart.status or apart.outcome or apart.roof_type or apart.faces)
-        if same and one.records[0].is_model and apart.residual * FULL_RESIDUAL_M <= SAME_RESIDUAL_M:
-            agreed.setdefault(one.records[0].roof_type, []).append(one)
-    counts = Counter({kind: len(found) for kind, found in agreed.items()})
-    kinds = sorted(agreed, key=lambda kind: (-counts[kind], kind))
+        same = not any(value for kind, value in one.difference.items() if kind != "residual")
+        if same and one.records[0]["is_model"] and one.difference["residual"] * FULL_RESIDUAL_M <= SAME_RESIDUAL_M:
+            agreed.setdefault(one.records[0]["roof_type"], []).append(one)
+    kinds = sorted(agreed, key=lambda kind: (-len(agreed[kind]), kind))
     for kind in kinds:
         middle = statistics.median(_area(one) for one in agreed[kind])
         agreed[kind].sort(key=lambda one: (abs(_area(one) - middle), one.building_id))
     turns = itertools.zip_longest(*(agreed[kind] for kind in kinds))
-    return [Choice(building=one, why="typical: all agree") for turn in turns for one in turn if one is not None]
+    return [Choice(one, "typical: all agree") for turn in turns for one in turn if one is not None]
 
 
 def _area(building: ComparedBuilding) -> float:
-    area = building.records[0].footprint_area_m2
-    return area if math.isfinite(area) else 0.0
+    return float(building.records[0]["footprint_area_m2"] or 0.0)

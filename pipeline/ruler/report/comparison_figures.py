@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from pipeline.model import RoofType, Status
 from pipeline.ruler.evaluation.chapters import NOTHING, number_text, printed, unit_sign
 from pipeline.ruler.evaluation.counts import OUTCOMES
 from pipeline.ruler.evaluation.definitions import DEFINITIONS
-from pipeline.ruler.report.comparison_building import ComparedBuilding, ComparedRun, Record
+from pipeline.ruler.report.comparison_records import ComparedBuilding, ComparedRun, Record, reference_of
 
 MEASURES = (
     "delivery.lod2",
@@ -33,59 +33,49 @@ MEASURES = (
 Records = Sequence[Record]
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Cell:
+class Cell(NamedTuple):
     """A cell of a table."""
 
     text: str
-    """The figure."""
     note: str = ""
     """An interval, a denominator, reasons."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class FigureTable:
+class FigureTable(NamedTuple):
     """Figures of all runs."""
 
     title: str
-    """Title."""
     first: str
     """Header of the first column."""
-    labels: tuple[str, ...]
-    """Labels of the runs: headers of the other columns."""
-    rows: tuple[tuple[str, tuple[Cell, ...]], ...]
+    rows: Sequence[tuple[str, Sequence[Cell]]]
     """A name and one cell per run."""
 
 
 def figure_tables(runs: Sequence[ComparedRun], buildings: Sequence[ComparedBuilding]) -> tuple[FigureTable, ...]:
     """Results, roof types, times and measures of the runs, without empty tables."""
     columns = [tuple(building.records[place] for building in buildings) for place in range(len(runs))]
-    tables = [_made(buildings, columns), _roof_types(columns), _seconds(columns), _measures(runs), _outcomes(runs)]
-    labels = tuple(run.label for run in runs)
-    return tuple(dataclasses.replace(table, labels=labels) for table in tables if table.rows)
+    tables = [_made(columns), _roof_types(columns), _seconds(columns), _measures(runs), _outcomes(runs)]
+    return tuple(table for table in tables if table.rows)
 
 
-def figure(value: float, unit: str, decimals: int) -> str:
+def figure(value: float | None, unit: str, decimals: int) -> str:
     """A figure with its unit; a dash if unknown."""
-    return number_text(value, unit, decimals) + unit_sign(unit) if math.isfinite(value) else NOTHING
+    known = value is not None and math.isfinite(value)
+    return number_text(float(value), unit, decimals) + unit_sign(unit) if known and value is not None else NOTHING
 
 
-def _rows(title: str, first: str, rows: Sequence[tuple[str, Sequence[Cell]]]) -> FigureTable:
-    return FigureTable(title=title, first=first, labels=(), rows=tuple((name, tuple(cells)) for name, cells in rows))
-
-
-def _made(buildings: Sequence[ComparedBuilding], columns: Sequence[Records]) -> FigureTable:
+def _made(columns: Sequence[Records]) -> FigureTable:
     """Statuses with reasons, planes, residuals, coverage, validity."""
-    common = [i for i, building in enumerate(buildings) if all(record.is_model for record in building.records)]
+    common = [i for i, records in enumerate(zip(*columns, strict=True)) if all(one["is_model"] for one in records)]
     names = {
         Status.OK: "models by the method",
         Status.DOUBTFUL: "models that their points do not support",
         Status.FALLBACK: "blocks in their place",
         Status.FAILED: "failed",
     }
-    rows: list[tuple[str, list[Cell]]] = [("candidates", [Cell(text=f"{len(records):,}") for records in columns])]
+    rows = [("candidates", [Cell(f"{len(records):,}") for records in columns])]
     rows += [(names[status], [_status(records, status) for records in columns]) for status in Status]
-    rows.append(("records with valid solids", [_share(sum(one.valid for one in r), len(r)) for r in columns]))
+    rows.append(("records with valid solids", [_share(sum(one["valid"] for one in r), len(r)) for r in columns]))
     rows.append(("roof planes of the models", [_planes(records) for records in columns]))
     for name, wanted in (("RMSE", "rmse_m"), ("95th percentile", "p95_m")):
         label = f"{name} of a building, median"
@@ -93,64 +83,56 @@ def _made(buildings: Sequence[ComparedBuilding], columns: Sequence[Records]) -> 
         both = [_median([records[i] for i in common], wanted, "m", 3) for records in columns]
         rows.append((f"{label}, where all have a model", both))
     rows.append(("points with a roof, median", [_median(records, "coverage", "share", 1) for records in columns]))
-    return _rows("What the methods made", "figure", rows)
+    return FigureTable("What the methods made", "figure", rows)
 
 
 def _status(records: Records, status: Status) -> Cell:
-    found = [record for record in records if record.status is status]
-    reasons = Counter(record.reason for record in found if record.reason is not None)
+    found = [record for record in records if record["status"] == status]
+    reasons = Counter(record["reason"] for record in found if record["reason"] is not None)
     note = [f"{reason} {n:,}" for reason, n in sorted(reasons.items(), key=lambda item: (-item[1], item[0]))]
     return _share(len(found), len(records), ", ".join(note))
 
 
 def _share(part: int, whole: int, note: str = "") -> Cell:
     share = figure(part / whole, "share", 1) if whole else NOTHING
-    return Cell(text=f"{part:,} ({share})", note=note)
+    return Cell(f"{part:,} ({share})", note)
 
 
 def _planes(records: Records) -> Cell:
-    planes = [record.n_planes for record in records if record.is_model]
-    mean = f"{np.mean(planes):.1f} a model" if planes else ""
-    return Cell(text=f"{sum(planes):,}", note=mean)
-
-
-def _known(records: Records, name: str) -> list[float]:
-    values = [float(getattr(record, name)) for record in records if record.status is not Status.FAILED]
-    return [value for value in values if math.isfinite(value)]
+    planes = [record["n_planes"] for record in records if record["is_model"]]
+    return Cell(f"{sum(planes):,}", f"{np.mean(planes):.1f} a model" if planes else "")
 
 
 def _median(records: Records, name: str, unit: str, decimals: int) -> Cell:
-    values = _known(records, name)
-    return Cell(
-        text=figure(float(np.median(values)) if values else math.nan, unit, decimals), note=f"n = {len(values):,}"
-    )
+    known = [record[name] for record in records if record["status"] != Status.FAILED and record[name] is not None]
+    return Cell(figure(float(np.median(known)) if known else None, unit, decimals), f"n = {len(known):,}")
 
 
 def _roof_types(columns: Sequence[Records]) -> FigureTable:
     """Number of buildings per roof type, without blocks and failed ones."""
-    counts = [Counter(record.roof_type for record in records if record.is_model) for records in columns]
+    counts = [Counter(record["roof_type"] for record in records if record["is_model"]) for records in columns]
     kinds = [kind.value for kind in RoofType if any(count[kind.value] for count in counts)]
-    rows = [(kind, [Cell(text=f"{count[kind]:,}") for count in counts]) for kind in kinds]
-    return _rows("Roof types of the models", "roof type", rows)
+    rows = [(kind, [Cell(f"{count[kind]:,}") for count in counts]) for kind in kinds]
+    return FigureTable("Roof types of the models", "roof type", rows)
 
 
 def _seconds(columns: Sequence[Records]) -> FigureTable:
     """Seconds per building, where known."""
-    known = [np.array([one.seconds for one in records if math.isfinite(one.seconds)]) for records in columns]
+    known = [np.array([one["seconds"] for one in records if one["seconds"] is not None]) for records in columns]
     if not any(len(values) for values in known):
-        return _rows("", "", [])
+        return FigureTable("", "", ())
     kinds: tuple[tuple[str, Callable[..., float]], ...] = (
-        ("median", lambda values: float(np.median(values))),
-        ("mean", lambda values: float(np.mean(values))),
+        ("median", np.median),
+        ("mean", np.mean),
         ("95th percentile", lambda values: float(np.quantile(values, 0.95))),
-        ("sum", lambda values: float(np.sum(values))),
+        ("sum", np.sum),
     )
     rows = [
-        (name, [Cell(text=seconds_text(of(values)) if len(values) else NOTHING) for values in known])
+        (name, [Cell(seconds_text(float(of(values))) if len(values) else NOTHING) for values in known])
         for name, of in kinds
     ]
-    rows.append(("buildings with a known time", [Cell(text=f"{len(values):,}") for values in known]))
-    return _rows("Time of a building", "seconds", rows)
+    rows.append(("buildings with a known time", [Cell(f"{len(values):,}") for values in known]))
+    return FigureTable("Time of a building", "seconds", rows)
 
 
 def seconds_text(seconds: float) -> str:
@@ -159,8 +141,6 @@ def seconds_text(seconds: float) -> str:
     >>> [seconds_text(s) for s in (0.0123, 0.5, 1.234, 12.34, 1234.5)]
     ['0.012 s', '0.500 s', '1.23 s', '12.3 s', '1,234 s']
     """
-    if not math.isfinite(seconds):
-        return NOTHING
     decimals = min(3, max(0, 2 - math.floor(math.log10(seconds)))) if seconds > 0.0 else 3
     return f"{seconds:,.{decimals}f} s"
 
@@ -172,19 +152,17 @@ def _measures(runs: Sequence[ComparedRun]) -> FigureTable:
         for run in runs
     ]
     rows = []
-    for name in MEASURES:
-        if not any(name in measures for measures in found):
-            continue
-        cells = []
-        for measures in found:
-            if name not in measures:
-                cells.append(Cell(text=NOTHING))
-                continue
-            line = printed(measures[name], DEFINITIONS[name])
-            cells.append(Cell(text=line.value, note=", ".join(t for t in (line.interval, f"n = {line.n}") if t)))
+    for name in (name for name in MEASURES if any(name in measures for measures in found)):
+        lines = [printed(measures[name], DEFINITIONS[name]) if name in measures else None for measures in found]
+        cells = [
+            Cell(NOTHING)
+            if line is None
+            else Cell(line.value, ", ".join(t for t in (line.interval, f"n = {line.n}") if t))
+            for line in lines
+        ]
         rows.append((DEFINITIONS[name].label, cells))
-    against = next((r.evaluation.reference for r in runs if r.evaluation and r.evaluation.reference), None)
-    return _rows("By themselves" if against is None else f"Against {against.name}", "measure", rows)
+    against = reference_of(runs)
+    return FigureTable("By themselves" if against is None else f"Against {against.name}", "measure", rows)
 
 
 def _outcomes(runs: Sequence[ComparedRun]) -> FigureTable:
@@ -193,18 +171,15 @@ def _outcomes(runs: Sequence[ComparedRun]) -> FigureTable:
     for run in runs:
         table = None if run.evaluation is None else run.evaluation.tables.get("outcomes")
         rows = [] if table is None else [row for row in table.to_pylist() if row["subset"] == "all"]
-        by_type = {row["true_type"]: [int(row[name]) for name in OUTCOMES] for row in rows}
-        by_type.pop("all", None)
-        by_type["all"] = [sum(row[i] for row in by_type.values()) for i in range(len(OUTCOMES))]
-        counts.append(by_type)
+        counts.append({row["true_type"]: [int(row[name]) for name in OUTCOMES] for row in rows})
     present = {kind for by_type in counts for kind, row in by_type.items() if sum(row)}
-    kinds = [kind.value for kind in RoofType if kind.value in present] + ["all"] * ("all" in present)
-    found = [(kind, [_outcome_cell(by_type.get(kind)) for by_type in counts]) for kind in kinds]
-    return _rows("Correct / passable / false by true roof type", "true roof type", found)
+    kinds = [kind for kind in (*RoofType, "all") if kind in present]
+    found = [(str(kind), [_outcome_cell(by_type.get(kind)) for by_type in counts]) for kind in kinds]
+    return FigureTable("Correct / passable / false by true roof type", "true roof type", found)
 
 
 def _outcome_cell(row: Sequence[int] | None) -> Cell:
     if row is None or not sum(row):
-        return Cell(text=NOTHING)
+        return Cell(NOTHING)
     note = f"{figure(row[0] / sum(row), 'share', 1)} correct of {sum(row):,}"
-    return Cell(text=" / ".join(f"{count:,}" for count in row), note=note)
+    return Cell(" / ".join(f"{count:,}" for count in row), note)

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from pipeline.model import RoofType, Status
@@ -16,7 +15,6 @@ from pipeline.ruler.evaluation.chapters import NOTHING
 from pipeline.ruler.evaluation.counts import OUTCOMES
 from pipeline.ruler.evaluation.markdown import markdown_cell, markdown_table
 from pipeline.ruler.evaluation.writing import INTERVALS, all_notes
-from pipeline.ruler.report.comparison_building import ComparedBuilding, ComparedRun, Record
 from pipeline.ruler.report.comparison_choice import RULE, Choice, most_different_first
 from pipeline.ruler.report.comparison_figures import FigureTable, figure, seconds_text
 from pipeline.ruler.report.comparison_pictures import (
@@ -27,23 +25,14 @@ from pipeline.ruler.report.comparison_pictures import (
     REACH_M,
     BuildingPictures,
 )
+from pipeline.ruler.report.comparison_records import ComparedBuilding, ComparedRun, Record, reference_of
+from pipeline.ruler.report.model_pictures import TRUTH_COLOUR
 from pipeline.ruler.report.section import RESIDUAL_CLASSES
-from pipeline.ruler.report.worst_cases import TRUTH_COLOUR
 from pipeline.runtime.manifest import RunManifest, RunStatus
 
 MAX_ROWS = 500
 """Buildings in the page's table."""
 _SETTINGS_DIGITS = 12
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class ComparisonCase:
-    """A building with its pictures."""
-
-    choice: Choice
-    """The building, and the reason."""
-    pictures: BuildingPictures
-    """Pictures of all runs."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -60,15 +49,20 @@ class Comparison:
     """Buildings that a run with failed tiles lacks."""
     tables: tuple[FigureTable, ...]
     """Figures side by side."""
-    cases: tuple[ComparisonCase, ...]
+    cases: tuple[tuple[Choice, BuildingPictures], ...]
     """The buildings that are drawn."""
     has_points: bool
     """Whether points were available."""
 
     @property
+    def labels(self) -> list[str]:
+        """Labels of the runs."""
+        return [run.label for run in self.runs]
+
+    @property
     def title(self) -> str:
         """Title of the page."""
-        *others, last = (run.label for run in self.runs)
+        *others, last = self.labels
         return f"{', '.join(others)} and {last}" if others else last
 
     @property
@@ -79,28 +73,39 @@ class Comparison:
         names = ", ".join(files[:4]) + (f" and {len(files) - 4} more files" if len(files) > 4 else "")
         return f"{len(self.buildings):,} {noun}" + (f" of {names}" if names else "")
 
+    @property
+    def records(self) -> list[Record]:
+        """All records of all buildings."""
+        return [record for one in self.buildings for record in one.records]
+
+    @property
+    def intervals(self) -> str:
+        """Explanation of the intervals; empty without evaluations."""
+        return INTERVALS if any(run.evaluation is not None for run in self.runs) else ""
+
 
 def page(comparison: Comparison) -> str:
     """The page as text: styles, pictures and the one script, which sorts a table, are in it."""
     ordered = most_different_first(comparison.buildings)[:MAX_ROWS]
-    has_outcomes = any(record.outcome is not None for one in comparison.buildings for record in one.records)
-    kinds = {
-        record.roof_type for case in comparison.cases for record in case.choice.building.records if record.is_model
-    }
+    columns = ["status", "roof", "planes", "RMSE, m", "time, s"]
+    if any(record["outcome"] is not None for record in comparison.records):
+        columns.append("outcome")
+    drawn = [record for choice, _ in comparison.cases for record in choice.building.records]
+    kinds = {record["roof_type"] for record in drawn if record["is_model"]}
     return page_template("comparison.html", "pipeline.ruler.report").render(
         title=comparison.title,
         subject=comparison.subject,
-        labels=[run.label for run in comparison.runs],
+        labels=comparison.labels,
         notes=_notes(comparison),
         stacks=_stacks(comparison),
         tables=comparison.tables,
         rule=RULE,
-        cases=[_case(comparison, case) for case in comparison.cases],
-        rows=[_row(one, has_outcomes) for one in ordered],
-        columns=_columns(has_outcomes),
+        cases=[_case(comparison, *case) for case in comparison.cases],
+        rows=[_row(one, columns) for one in ordered],
+        columns=columns,
         n_buildings=len(comparison.buildings),
         made=_made(comparison),
-        intervals=INTERVALS if _has_intervals(comparison) else "",
+        intervals=comparison.intervals,
         residuals=RESIDUAL_CLASSES if comparison.has_points else (),
         roofs=[(kind.value, ROOF_COLOURS[kind]) for kind in RoofType if kind.value in kinds],
         truth_colour=TRUTH_COLOUR,
@@ -110,13 +115,9 @@ def page(comparison: Comparison) -> str:
         low_m=LOW_M,
         reach_m=REACH_M,
         has_points=comparison.has_points,
-        has_truth=any(case.pictures.truth for case in comparison.cases),
-        has_outlines=any(case.choice.building.true_id for case in comparison.cases),
+        has_truth=any(pictures.truth for _, pictures in comparison.cases),
+        has_outlines=any(choice.building.true_id for choice, _ in comparison.cases),
     )
-
-
-def _has_intervals(comparison: Comparison) -> bool:
-    return any(run.evaluation is not None for run in comparison.runs)
 
 
 def _notes(comparison: Comparison) -> list[str]:
@@ -128,147 +129,134 @@ def _notes(comparison: Comparison) -> list[str]:
         elif manifest.status is not RunStatus.FINISHED:
             notes.append(f"{run.label}: the run is {manifest.status.value}; not all of its buildings may be there.")
     if comparison.left_out:
-        rest = ", except from the evaluations of the runs" if _has_intervals(comparison) else ""
+        rest = ", except from the evaluations of the runs" if comparison.intervals else ""
         notes.append(f"{comparison.left_out:,} buildings that not all runs have are left out below{rest}.")
     if not comparison.has_points:
         notes.append("No points were available: the pictures show models alone.")
-    evaluations = [run.evaluation for run in comparison.runs if run.evaluation is not None]
-    known = [set(all_notes(evaluation)) for evaluation in evaluations]
-    if known:
-        notes += [note for note in all_notes(evaluations[0]) if all(note in one for one in known)]
+    known = [all_notes(run.evaluation) for run in comparison.runs if run.evaluation is not None]
+    notes += [note for note in (known[0] if known else ()) if all(note in one for one in known)]
     return list(dict.fromkeys(notes))
 
 
 def _stacks(comparison: Comparison) -> list[dict[str, Any]]:
     """Bars of statuses and of judged outcomes: title, and one row per run of (name, count, share)."""
-    stacks = [_stack("Candidates", _counts(comparison, list(Status), lambda record: record.status), comparison)]
-    outcomes = _counts(comparison, OUTCOMES, lambda record: record.outcome)
-    if any(sum(counts) for _, counts in outcomes):
-        stacks.append(_stack("Against the truth, of the candidates with a true building", outcomes, comparison))
-    return stacks
+    stacks = [_stack(comparison, "Candidates", "status", list(Status))]
+    outcomes = _stack(comparison, "Against the truth, of the candidates with a true building", "outcome", OUTCOMES)
+    return stacks + [outcomes] * any(row["parts"] for row in outcomes["rows"])
 
 
-def _counts(
-    comparison: Comparison, names: Sequence[str], of: Callable[[Record], str | None]
-) -> list[tuple[str, list[int]]]:
-    """Number of records per run, one row per name."""
-    found = [Counter(of(one.records[i]) for one in comparison.buildings) for i in range(len(comparison.runs))]
-    return [(str(name), [counts[name] for counts in found]) for name in names]
-
-
-def _stack(title: str, parts: Sequence[tuple[str, Sequence[int]]], comparison: Comparison) -> dict[str, Any]:
+def _stack(comparison: Comparison, title: str, column: str, names: Sequence[str]) -> dict[str, Any]:
     rows = []
-    for place, run in enumerate(comparison.runs):
-        total = sum(counts[place] for _, counts in parts)
-        held = [(name, counts[place], counts[place] / total) for name, counts in parts if counts[place]]
-        counted = ", ".join(f"{name} {count:,}" for name, count, _ in held)
-        rows.append({"label": run.label, "parts": held, "description": f"{run.label}: {counted or 'none'}"})
-    return {"title": title, "names": [name for name, _ in parts], "rows": rows}
+    for place, label in enumerate(comparison.labels):
+        counts = Counter(one.records[place][column] for one in comparison.buildings)
+        held = [(str(name), counts[name]) for name in names if counts[name]]
+        total = sum(count for _, count in held)
+        counted = ", ".join(f"{name} {count:,}" for name, count in held) or "none"
+        parts = [(name, count, count / total) for name, count in held]
+        rows.append({"label": label, "parts": parts, "description": f"{label}: {counted}"})
+    return {"title": title, "names": list(map(str, names)), "rows": rows}
 
 
-def _case(comparison: Comparison, case: ComparisonCase) -> dict[str, Any]:
+def _case(comparison: Comparison, choice: Choice, pictures: BuildingPictures) -> dict[str, Any]:
     """One row of pictures."""
-    building, pictures = case.choice.building, case.pictures
-    name = building.building_id
-    views = []
-    for run, record, png in zip(comparison.runs, building.records, pictures.views, strict=True):
-        views.append(
-            {
-                "label": run.label,
-                "uri": None if png is None else data_uri(png),
-                "alt": f"{name} by {run.label}: {_summary(record)}.",
-                "status": record.status.value,
-                "reason": record.reason,
-                "detail": record.reason_detail,
-                "outcome": record.outcome,
-                "figures": _figures(record),
-            }
-        )
-    truth = next((dict(record.truth) for record in building.records if record.truth), {})
+    building = choice.building
+    name, records = building.building_id, building.records
+    views = [
+        {
+            "label": label,
+            "uri": None if png is None else data_uri(png),
+            "alt": f"{name} by {label}: {_summary(record)}.",
+            "status": record["status"],
+            "reason": record["reason"],
+            "detail": record["reason_detail"],
+            "outcome": record["outcome"],
+            "figures": _figures(record),
+        }
+        for label, record, png in zip(comparison.labels, records, pictures.views, strict=True)
+    ]
+    judged = next((record for record in records if record["true_type"] is not None), records[0])
     return {
         "name": name,
-        "why": case.choice.why,
+        "why": choice.why,
         "pictures": pictures,
         "plan": None if pictures.plan is None else data_uri(pictures.plan),
         "views": views,
         "truth": None if pictures.truth is None else data_uri(pictures.truth),
         "true_id": building.true_id,
-        "true_type": truth.get("true_type"),
-        "true_faces": truth.get("faces_to_find"),
-        "area": next((figure(r.footprint_area_m2, "m2", 0) for r in building.records if r.lod), NOTHING),
+        "true_type": judged["true_type"],
+        "true_faces": judged["faces_to_find"],
+        "area": next((figure(one["footprint_area_m2"], "m2", 0) for one in records if one["lod"]), NOTHING),
     }
 
 
 def _summary(record: Record) -> str:
     """A record in a few words."""
-    if record.status is Status.FAILED:
-        return f"failed, {record.reason}"
-    kind = "model" if record.is_model else f"block in place of a model, {record.reason}"
-    if record.status is Status.DOUBTFUL:
-        kind = f"doubtful model, {record.reason}"
-    planes = f"{record.n_planes} {'plane' if record.n_planes == 1 else 'planes'}"
-    return f"{kind}, {record.roof_type} roof, {planes}, RMSE {figure(record.rmse_m, 'm', 3)}"
+    reason = record["reason"]
+    kinds = {
+        Status.OK: "model",
+        Status.DOUBTFUL: f"doubtful model, {reason}",
+        Status.FALLBACK: f"block in place of a model, {reason}",
+    }
+    if record["status"] == Status.FAILED:
+        return f"failed, {reason}"
+    planes = f"{record['n_planes']} {'plane' if record['n_planes'] == 1 else 'planes'}"
+    rmse = figure(record["rmse_m"], "m", 3)
+    return f"{kinds[Status(record['status'])]}, {record['roof_type']} roof, {planes}, RMSE {rmse}"
 
 
 def _figures(record: Record) -> list[tuple[str, str]]:
     """The caption of a picture."""
+    is_there = record["status"] != Status.FAILED
     figures = []
-    if record.status is not Status.FAILED:
-        figures += [("roof", record.roof_type), ("planes", f"{record.n_planes}")]
-        figures += [("RMSE", figure(record.rmse_m, "m", 3)), ("covered", figure(record.coverage, "share", 1))]
-    if math.isfinite(record.seconds):
-        figures.append(("time", seconds_text(record.seconds)))
-    found = record.truth.get("faces_found")
-    if found is not None:
-        figures.append(("faces found", f"{found} of {record.truth.get('faces_to_find')}"))
-        figures.append(("wrong faces", f"{record.truth.get('faces_wrong') or 0}"))
-    if record.truth.get("iou") and record.status is not Status.FAILED:
-        figures.append(("footprint IoU", f"{record.truth['iou']:.2f}"))
+    if is_there:
+        figures += [("roof", record["roof_type"]), ("planes", f"{record['n_planes']}")]
+        figures += [("RMSE", figure(record["rmse_m"], "m", 3)), ("covered", figure(record["coverage"], "share", 1))]
+    if record["seconds"] is not None:
+        figures.append(("time", seconds_text(record["seconds"])))
+    if record["faces_found"] is not None:
+        figures.append(("faces found", f"{record['faces_found']} of {record['faces_to_find']}"))
+        figures.append(("wrong faces", f"{record['faces_wrong'] or 0}"))
+    if record["iou"] and is_there:
+        figures.append(("footprint IoU", f"{record['iou']:.2f}"))
     return figures
 
 
-def _columns(has_outcomes: bool) -> list[str]:
-    return ["status", "roof", "planes", "RMSE, m", "time, s", *(["outcome"] if has_outcomes else [])]
-
-
-def _row(building: ComparedBuilding, has_outcomes: bool) -> dict[str, Any]:
+def _row(building: ComparedBuilding, columns: Sequence[str]) -> dict[str, Any]:
     """One row of the table of buildings: texts with their sort values."""
     cells = []
     for record in building.records:
-        status = record.status.value + (f": {record.reason}" if record.reason else "")
-        cells += [(status, status), (record.roof_type, record.roof_type), (str(record.n_planes), record.n_planes)]
-        cells += [_number(record.rmse_m, 3), _number(record.seconds, 3)]
-        if has_outcomes:
-            cells.append((record.outcome or NOTHING, record.outcome or ""))
-    area = next((r.footprint_area_m2 for r in building.records if math.isfinite(r.footprint_area_m2)), math.nan)
-    own = [_number(area, 0), _number(building.difference.total, 2)]
+        status = record["status"] + (f": {record['reason']}" if record["reason"] else "")
+        cells += [(status, status), (record["roof_type"],) * 2, (str(record["n_planes"]), record["n_planes"])]
+        cells += [_number(record["rmse_m"], 3), _number(record["seconds"], 3)]
+        if "outcome" in columns:
+            cells.append((record["outcome"] or NOTHING, record["outcome"] or ""))
+    area = next((one["footprint_area_m2"] for one in building.records if one["footprint_area_m2"] is not None), None)
+    own = [_number(area, 0), _number(building.total, 2)]
     return {"name": building.building_id, "own": own, "cells": cells}
 
 
-def _number(value: float, decimals: int) -> tuple[str, Any]:
-    return (f"{value:.{decimals}f}", round(value, 6)) if math.isfinite(value) else (NOTHING, "")
+def _number(value: float | None, decimals: int) -> tuple[str, Any]:
+    return (NOTHING, "") if value is None else (f"{value:.{decimals}f}", round(value, 6))
 
 
 def _made(comparison: Comparison) -> dict[str, Any]:
     """Inputs, settings, digests and versions."""
     first = comparison.manifests[0]
-    rows = []
-    for run, manifest in zip(comparison.runs, comparison.manifests, strict=True):
-        rows.append(
-            (
-                run.label,
-                run.method,
-                run.preset,
-                manifest.settings_hash[:_SETTINGS_DIGITS],
-                (manifest.content_sha256 or NOTHING)[:_SETTINGS_DIGITS],
-                manifest.engine_version,
-            )
+    rows = [
+        (
+            run.label,
+            run.method,
+            run.preset,
+            manifest.settings_hash[:_SETTINGS_DIGITS],
+            (manifest.content_sha256 or NOTHING)[:_SETTINGS_DIGITS],
+            manifest.engine_version,
         )
-    crs: Mapping[str, Any] = first.crs or {}
-    facts = [("reference system", str(crs.get("name") or "unknown"))]
+        for run, manifest in zip(comparison.runs, comparison.manifests, strict=True)
+    ]
+    facts = [("reference system", str((first.crs or {}).get("name") or "unknown"))]
     if first.source_licence:
         facts.append(("licence of the data", first.source_licence))
-    reference = next((r.evaluation.reference for r in comparison.runs if r.evaluation and r.evaluation.reference), None)
+    reference = reference_of(comparison.runs)
     if reference is not None:
         facts.append(("measured against", reference.name))
     return {
@@ -285,18 +273,16 @@ def _made(comparison: Comparison) -> dict[str, Any]:
 def markdown(comparison: Comparison) -> str:
     """The figures and how they were made, as Markdown."""
     parts = [f"# Compared: {markdown_cell(comparison.title)}", f"{markdown_cell(comparison.subject)}."]
-    notes = _notes(comparison)
-    if notes:
-        parts.append("\n".join(f"- {markdown_cell(note)}" for note in notes))
+    parts.append("\n".join(f"- {markdown_cell(note)}" for note in _notes(comparison)))
     for table in comparison.tables:
         rows = [(name, *(f"{c.text} ({c.note})" if c.note else c.text for c in cells)) for name, cells in table.rows]
-        parts.append(f"## {markdown_cell(table.title)}\n\n{markdown_table((table.first, *table.labels), rows)}")
-    if _has_intervals(comparison):
-        parts.append(INTERVALS)
-    header = ("building", "chosen for", *(run.label for run in comparison.runs))
+        text = markdown_table((table.first, *comparison.labels), rows)
+        parts.append(f"## {markdown_cell(table.title)}\n\n{text}")
+    parts.append(comparison.intervals)
+    header = ("building", "chosen for", *comparison.labels)
     rows = [
-        (c.choice.building.building_id, c.choice.why, *(_brief(record) for record in c.choice.building.records))
-        for c in comparison.cases
+        (choice.building.building_id, choice.why, *(_brief(record) for record in choice.building.records))
+        for choice, _ in comparison.cases
     ]
     if rows:
         parts.append(f"## Buildings side by side\n\n{RULE}\n\n{markdown_table(header, rows, texts=len(header))}")
@@ -305,10 +291,9 @@ def markdown(comparison: Comparison) -> str:
     parts.append("\n".join(f"- {name}: {markdown_cell(text)}" for name, text in made["facts"]))
     if made["inputs"]:
         parts.append(markdown_table(("input", "bytes", "points", "sha256"), made["inputs"]))
-    return "\n\n".join(parts) + "\n"
+    return "\n\n".join(part for part in parts if part) + "\n"
 
 
 def _brief(record: Record) -> str:
     """A record in a cell."""
-    summary = _summary(record)
-    return f"{summary}, {record.outcome}" if record.outcome else summary
+    return f"{_summary(record)}, {record['outcome']}" if record["outcome"] else _summary(record)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
+import itertools
 import json
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,45 +14,94 @@ import pyproj
 import shapely
 
 from pipeline.errors import RunError
-from pipeline.export.geoparquet import geo_metadata, read_table
+from pipeline.export.geoparquet import geo_metadata, read_table, stored_schema
 from pipeline.model import Status
 from pipeline.ruler.evaluation.evaluate import Evaluation
-from pipeline.ruler.report.comparison_building import ComparedBuilding, ComparedRun, Record, difference_of
+from pipeline.ruler.evaluation.matching import one_to_one
 from pipeline.runtime.manifest import RunManifest
 
-_COLUMNS = ("status", "reason", "reason_detail", "lod", "roof_type", "n_planes", "rmse_m", "p95_m", "coverage", "valid")
-_READ = ("building_id", *_COLUMNS, "footprint_area_m2", "touches_data_edge", "geometry")
-_TRUTH = ("true_type", "outcome", "faces_to_find", "faces_found", "faces_wrong", "iou")
-_SCHEMA = pa.schema(
-    [
-        pa.field("building_id", pa.string(), nullable=False),
-        pa.field("label", pa.string(), nullable=False),
-        pa.field("method", pa.string(), nullable=False),
-        pa.field("preset", pa.string(), nullable=False),
-        pa.field("status", pa.string(), nullable=False),
-        pa.field("reason", pa.string()),
-        pa.field("reason_detail", pa.string(), nullable=False),
-        pa.field("lod", pa.string()),
-        pa.field("roof_type", pa.string(), nullable=False),
-        pa.field("n_planes", pa.int32(), nullable=False),
-        pa.field("rmse_m", pa.float64()),
-        pa.field("p95_m", pa.float64()),
-        pa.field("coverage", pa.float64()),
-        pa.field("valid", pa.bool_(), nullable=False),
-        pa.field("footprint_area_m2", pa.float64()),
-        pa.field("seconds", pa.float64()),
-        pa.field("difference", pa.float64(), nullable=False),
-    ]
+FULL_RESIDUAL_M = 0.2
+"""A difference of RMSE that counts in full."""
+_COLUMNS = (
+    *("status", "reason", "reason_detail", "lod", "roof_type", "n_planes", "rmse_m", "p95_m", "coverage", "valid"),
+    "footprint_area_m2",
 )
-_TRUTH_FIELDS = (
-    pa.field("true_id", pa.string()),
-    pa.field("true_type", pa.string()),
-    pa.field("outcome", pa.string()),
-    pa.field("faces_to_find", pa.int64()),
-    pa.field("faces_found", pa.int64()),
-    pa.field("faces_wrong", pa.int64()),
-    pa.field("iou", pa.float64()),
-)
+_READ = ("building_id", *_COLUMNS, "touches_data_edge", "geometry")
+_TRUTH = {
+    "true_id": pa.string(),
+    "true_type": pa.string(),
+    "outcome": pa.string(),
+    "faces_to_find": pa.int64(),
+    "faces_found": pa.int64(),
+    "faces_wrong": pa.int64(),
+    "iou": pa.float64(),
+}
+
+Record = Mapping[str, Any]
+"""The record of a building in one run: columns of its table `buildings`; `seconds`; `is_model`, whether the model of
+the method was delivered; and `_TRUTH` from the evaluation's row of its true building. None if unknown."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ComparedRun:
+    """A run that is compared."""
+
+    label: str
+    """Its label in tables and pages."""
+    method: str
+    """Name of the method."""
+    preset: str
+    """Name of its settings."""
+    run_dir: str
+    """A finished local run directory."""
+    seconds: Mapping[str, float] | None = None
+    """Seconds per building, by building_id; missing ones are unknown."""
+    evaluation: Evaluation | None = None
+    """Evaluation of this run; all have one reference."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ComparedBuilding:
+    """A building in all runs."""
+
+    building_id: str
+    """The same in all."""
+    records: tuple[Record, ...]
+    """One per run, in their order."""
+    true_id: str | None
+    """Id of the reference building under it; None without one."""
+    difference: Mapping[str, float]
+    """Differences of the runs by kind, see `differences`."""
+
+    @property
+    def total(self) -> float:
+        """Sum of all differences."""
+        return sum(self.difference.values())
+
+
+def differences(records: Sequence[Record]) -> dict[str, float]:
+    """Differences between the records of one building, each from 0 (all agree) to 1.
+
+    Shares of pairs of runs with different `status`, different `outcome` where judged, and different `roof_type` among
+    the runs with a model of their own, as the next two; `faces`: largest minus smallest number of planes over the
+    largest; `residual`: largest minus smallest RMSE, 0.2 m counting in full.
+    """
+    modelled = [record for record in records if record["is_model"]]
+    planes = [record["n_planes"] for record in modelled]
+    rmse = [record["rmse_m"] for record in modelled if record["rmse_m"] is not None]
+    return {
+        "status": _pairs_apart([record["status"] for record in records]),
+        "outcome": _pairs_apart([record["outcome"] for record in records if record["outcome"] is not None]),
+        "roof_type": _pairs_apart([record["roof_type"] for record in modelled]),
+        "faces": (max(planes) - min(planes)) / max(*planes, 1) if planes else 0.0,
+        "residual": min(1.0, (max(rmse) - min(rmse)) / FULL_RESIDUAL_M) if rmse else 0.0,
+    }
+
+
+def _pairs_apart(values: Sequence[Hashable]) -> float:
+    """Share of pairs that are not equal; 0 without a pair."""
+    pairs = list(itertools.combinations(values, 2))
+    return sum(a != b for a, b in pairs) / len(pairs) if pairs else 0.0
 
 
 def read_buildings(runs: Sequence[ComparedRun], manifests: Sequence[RunManifest]) -> tuple[list[ComparedBuilding], int]:
@@ -59,7 +109,10 @@ def read_buildings(runs: Sequence[ComparedRun], manifests: Sequence[RunManifest]
 
     Raises RunError if the runs have different buildings although none has failed tiles: their candidates differ.
     """
-    tables = [_rows_of(run) for run in runs]
+    tables = []
+    for run in runs:
+        rows = read_table(run.run_dir, "buildings").select(list(_READ)).to_pylist()
+        tables.append({row["building_id"]: row for row in rows})
     everywhere = set(tables[0]).intersection(*tables)
     anywhere = set(tables[0]).union(*tables)
     if everywhere != anywhere and not any(manifest.failed_tiles for manifest in manifests):
@@ -74,48 +127,30 @@ def read_buildings(runs: Sequence[ComparedRun], manifests: Sequence[RunManifest]
         )
     names = sorted(everywhere)
     true_ids = _true_buildings(names, runs)
-    rows_of_truth = [_truth_rows(run.evaluation) for run in runs]
+    truths = [_truth_rows(run.evaluation) for run in runs]
     buildings = []
     for name in names:
+        true_id = true_ids.get(name)
         records = tuple(
-            _record(table[name], run, truth.get(true_ids.get(name), {}))
-            for table, run, truth in zip(tables, runs, rows_of_truth, strict=True)
+            {
+                **dict.fromkeys(_TRUTH),
+                **truth.get(true_id, {}),
+                **table[name],
+                "true_id": true_id,
+                "seconds": (run.seconds or {}).get(name),
+                "is_model": Status(table[name]["status"]).has_roof,
+            }
+            for table, run, truth in zip(tables, runs, truths, strict=True)
         )
         buildings.append(
-            ComparedBuilding(
-                building_id=name, records=records, true_id=true_ids.get(name), difference=difference_of(records)
-            )
+            ComparedBuilding(building_id=name, records=records, true_id=true_id, difference=differences(records))
         )
     return buildings, len(anywhere - everywhere)
 
 
-def _rows_of(run: ComparedRun) -> dict[str, Mapping[str, Any]]:
-    """The records of a run, by building_id."""
-    table = read_table(run.run_dir, "buildings").select(list(_READ))
-    return {row["building_id"]: row for row in table.to_pylist()}
-
-
-def _record(row: Mapping[str, Any], run: ComparedRun, truth: Mapping[str, Any]) -> Record:
-    def figure(name: str) -> float:
-        return math.nan if row[name] is None else float(row[name])
-
-    return Record(
-        status=Status(row["status"]),
-        reason=row["reason"],
-        reason_detail=row["reason_detail"],
-        lod=row["lod"],
-        roof_type=row["roof_type"],
-        n_planes=row["n_planes"],
-        rmse_m=figure("rmse_m"),
-        p95_m=figure("p95_m"),
-        coverage=figure("coverage"),
-        valid=row["valid"],
-        footprint_area_m2=figure("footprint_area_m2"),
-        seconds=(run.seconds or {}).get(row["building_id"], math.nan),
-        touches_data_edge=row["touches_data_edge"],
-        geometry=row["geometry"],
-        truth=truth,
-    )
+def reference_of(runs: Sequence[ComparedRun]) -> Any | None:
+    """The reference of the evaluations; None without one."""
+    return next((run.evaluation.reference for run in runs if run.evaluation and run.evaluation.reference), None)
 
 
 def _truth_rows(evaluation: Evaluation | None) -> dict[str | None, Mapping[str, Any]]:
@@ -123,11 +158,8 @@ def _truth_rows(evaluation: Evaluation | None) -> dict[str | None, Mapping[str, 
     table = None if evaluation is None or evaluation.reference is None else evaluation.tables.get("buildings")
     if table is None:
         return {}
-    return {row["building_id"]: row for row in table.select(_known(table)).to_pylist()}
-
-
-def _known(table: pa.Table) -> list[str]:
-    return [name for name in ("building_id", "model_id", *_TRUTH) if name in table.column_names]
+    known = [name for name in ("building_id", *_TRUTH) if name in table.column_names]
+    return {row["building_id"]: row for row in table.select(known).to_pylist()}
 
 
 def _true_buildings(names: Sequence[str], runs: Sequence[ComparedRun]) -> dict[str, str]:
@@ -135,7 +167,7 @@ def _true_buildings(names: Sequence[str], runs: Sequence[ComparedRun]) -> dict[s
 
     The union of the footprints of all runs is the place of a building, so all runs have one true building.
     """
-    reference = next((run.evaluation.reference for run in runs if run.evaluation and run.evaluation.reference), None)
+    reference = reference_of(runs)
     if reference is None or not reference.buildings or not names:
         return {}
     footprints: dict[str, list[Any]] = {name: [] for name in names}
@@ -144,41 +176,31 @@ def _true_buildings(names: Sequence[str], runs: Sequence[ComparedRun]) -> dict[s
             for model in (*run.evaluation.models.models, *run.evaluation.models.failed):
                 if model.building_id in footprints:
                     footprints[model.building_id].append(model.footprint)
-    places = [shapely.union_all(footprints[name]) for name in names]
-    true = [building.footprint for building in reference.buildings]
-    pairs = shapely.STRtree(true).query(places, predicate="intersects")
-    common = [shapely.intersection(places[place], true[number]).area for place, number in pairs.T]
-    order = sorted(
-        (-round(area, 6), names[place], reference.buildings[number].building_id)
-        for area, (place, number) in zip(common, pairs.T.tolist(), strict=True)
-    )
-    found: dict[str, str] = {}
-    taken = set()
-    for area, name, true_id in order:
-        if area < 0.0 and name not in found and true_id not in taken:
-            found[name] = true_id
-            taken.add(true_id)
-    return found
+    places = np.array([shapely.union_all(footprints[name]) for name in names], object)
+    true = np.array([building.footprint for building in reference.buildings], object)
+    place, number = shapely.STRtree(true).query(places, predicate="intersects")
+    common = shapely.area(shapely.intersection(places[place], true[number])).round(6)
+    held = np.flatnonzero(common > 0.0)
+    kept = held[one_to_one(place[held], number[held], common[held])]
+    return {names[k]: reference.buildings[n].building_id for k, n in zip(place[kept], number[kept], strict=True)}
 
 
 def buildings_table(
     runs: Sequence[ComparedRun], buildings: Sequence[ComparedBuilding], projjson: Mapping[str, Any] | None
 ) -> pa.Table:
     """One row per building and run as GeoParquet, with columns of the truth if there are evaluations."""
-    schema = _SCHEMA
-    if any(run.evaluation is not None and run.evaluation.reference is not None for run in runs):
-        for field in _TRUTH_FIELDS:
-            schema = schema.append(field)
-    schema = schema.append(pa.field("geometry", pa.binary()))
-    rows = []
-    for building in buildings:
-        for run, record in zip(runs, building.records, strict=True):
-            row: dict[str, Any] = {name: getattr(record, name) for name in (*_COLUMNS, "footprint_area_m2", "seconds")}
-            row |= {name: None for name, value in row.items() if isinstance(value, float) and math.isnan(value)}
-            row |= {name: record.truth.get(name) for name in _TRUTH}
-            row |= {"building_id": building.building_id, "true_id": building.true_id, "status": record.status.value}
-            row |= {"label": run.label, "method": run.method, "preset": run.preset, "geometry": record.geometry}
-            rows.append(row | {"difference": round(building.difference.total, 6)})
+    stored = stored_schema("buildings")
+    fields = [pa.field(name, pa.string(), nullable=False) for name in ("building_id", "label", "method", "preset")]
+    fields += [stored.field(name).remove_metadata() for name in _COLUMNS]
+    fields += [pa.field("seconds", pa.float64()), pa.field("difference", pa.float64(), nullable=False)]
+    if reference_of(runs) is not None:
+        fields += [pa.field(name, kind) for name, kind in _TRUTH.items()]
+    schema = pa.schema([*fields, pa.field("geometry", pa.binary())])
+    rows = [
+        {**record, "label": run.label, "method": run.method, "preset": run.preset, "difference": round(one.total, 6)}
+        for one in buildings
+        for run, record in zip(runs, one.records, strict=True)
+    ]
     table = pa.Table.from_pylist([{name: row[name] for name in schema.names} for row in rows], schema=schema)
     geometries = shapely.from_wkb(np.array([row["geometry"] for row in rows], dtype=object))
     metadata = geo_metadata(geometries, projjson)

@@ -22,7 +22,7 @@ from pipeline.ruler.epochs.summary import HEIGHT_EDGES_M, LARGEST
 from pipeline.ruler.epochs.writing import PARQUET
 from pipeline.ruler.evaluation.chapters import NOTHING as _NOTHING
 from pipeline.ruler.report.epochs_map import COLOURS
-from pipeline.ruler.report.epochs_pictures import HEIGHT_PX, NEW_LINE, OLD_LINE, WIDTH_PX, Case, cases
+from pipeline.ruler.report.epochs_pictures import NEW_LINE, OLD_LINE, SIZE_PX, Case, cases
 from pipeline.ruler.report.svg_chart import Axis, Ordinate, histogram_svg
 
 PAGE = "changes.html"
@@ -70,7 +70,7 @@ def page(diff: Diff, rows: ClassMap) -> str:
         reasons=[(INCOMPARABLE[Incomparable(name)], count) for name, count in facts["reasons"].items()],
         doubts=[(DOUBTS[Doubt(name)], count) for name, count in facts["doubts"].items()],
         cases=[_case(case) for case in pictures],
-        size=(WIDTH_PX, HEIGHT_PX),
+        size=SIZE_PX,
         lines=(OLD_LINE, NEW_LINE),
         columns=[header for header, *_ in _CELLS],
         rows=listed,

@@ -18,9 +18,9 @@ from pipeline.ruler.evaluation.model_figures import TITLE, model_figures
 from pipeline.ruler.evaluation.writing import INTERVALS, all_notes, subject_sentences
 from pipeline.ruler.report.evaluation_maps import maps
 from pipeline.ruler.report.histograms import charts
-from pipeline.ruler.report.models_view import models_view
+from pipeline.ruler.report.model_pictures import TRUTH_COLOUR, models_view
 from pipeline.ruler.report.section import RESIDUAL_CLASSES
-from pipeline.ruler.report.worst_cases import MAX_NOT_FOUND, MODEL_COLOUR, SECTION_COLOUR, TRUTH_COLOUR, worst_cases
+from pipeline.ruler.report.worst_cases import MAX_NOT_FOUND, MODEL_COLOUR, SECTION_COLOUR, worst_cases
 
 PAGE = "report.html"
 """The file."""

@@ -11,16 +11,15 @@ import numpy as np
 import pyarrow as pa
 import shapely
 from markupsafe import Markup
-from matplotlib.collections import LineCollection, PathCollection
+from matplotlib.collections import PathCollection
 
 from pipeline.model import FloatArray, LabelArray
-from pipeline.report.perspective import View, draw_view
 from pipeline.report.pictures import blank, paths_of, png_of
 from pipeline.ruler.evaluation.evaluate import Evaluation
 from pipeline.ruler.evaluation.models import RoofModel
 from pipeline.ruler.evaluation.reference import Reference
+from pipeline.ruler.report.model_pictures import corners_of, draw_true_edges, view_png, viewed_faces
 from pipeline.ruler.report.section import RESIDUAL_CLASSES, UNCOVERED, profile_line, residual_class, section_svg, top_of
-from pipeline.ruler.report.viewed_models import viewed_faces
 
 CASES = 12
 """Largest number of cases."""
@@ -32,7 +31,7 @@ POINTS_PER_CASE = 12_000
 """Most points of a building; more are thinned evenly."""
 SIDE_PX = 560
 """Width and height of a picture."""
-TRUTH_COLOUR, MODEL_COLOUR, SECTION_COLOUR = "#2a9470", "#7f93a6", "#777d86"
+MODEL_COLOUR, SECTION_COLOUR = "#7f93a6", "#777d86"
 _MARGIN_M = 1.5
 _BADNESS = {"false": 0, "passable": 1, "correct": 2}
 
@@ -150,12 +149,12 @@ def _case(
     xyz: FloatArray,
 ) -> Case:
     view_is_truth = not own
-    viewed = [truth] if view_is_truth else list(own)
+    viewed = [viewed_faces(one) for one in (own or [truth])]
     return Case(
         building_id=truth.building_id,
         figures=_figures(row),
         plan_png=_plan(truth, own, around, xyz),
-        view_png=_view(viewed),
+        view_png=view_png(viewed, corners_of(viewed), (SIDE_PX, SIDE_PX)),
         view_is_truth=view_is_truth,
         section=section_svg(truth, own, xyz),
     )
@@ -239,33 +238,10 @@ def _plan(truth: RoofModel, own: Sequence[RoofModel], around: Sequence[RoofModel
             linewidths=1.1,
             zorder=4,
         )
-    outlines = [surface.polygon for surface in truth.surfaces] or [truth.footprint]
-    rings = [shapely.get_coordinates(ring)[:, :2] for ring in shapely.get_rings(outlines)]
-    axes.add_collection(LineCollection(rings, colors=TRUTH_COLOUR, linewidths=2.0, linestyles=(0, (5, 2.5)), zorder=5))
+    draw_true_edges(axes, truth, np.zeros(2), 2.0)
     middle, along, half = profile_line(truth, own, xyz)
     line = np.array([middle - (half + _MARGIN_M) * along, middle + (half + _MARGIN_M) * along])
     axes.plot(line[:, 0], line[:, 1], color=SECTION_COLOUR, linewidth=1.3, marker="o", markersize=4.0, zorder=6)
     axes.set_xlim(x - side / 2.0, x + side / 2.0)
     axes.set_ylim(y - side / 2.0, y + side / 2.0)
-    return png_of(figure)
-
-
-def _view(models: Sequence[RoofModel]) -> bytes | None:
-    """Bird's-eye view; None without a face."""
-    viewed = [faces for model in models if (faces := viewed_faces(model))]
-    if not viewed:
-        return None
-    middle = np.mean([face.rings[0].mean(axis=0) for faces in viewed for face in faces], axis=0)
-    local = [
-        [dataclasses.replace(face, rings=tuple(ring - middle for ring in face.rings)) for face in faces]
-        for faces in viewed
-    ]
-    figure, axes = blank(SIDE_PX, SIDE_PX)
-    draw_view(axes, local, View(), shadows=False)
-    (drawn,) = axes.collections
-    corners = np.concatenate([path.vertices for path in drawn.get_paths()])
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    half = 0.54 * float((high - low).max())
-    axes.set_xlim((low[0] + high[0]) / 2.0 - half, (low[0] + high[0]) / 2.0 + half)
-    axes.set_ylim((low[1] + high[1]) / 2.0 - half, (low[1] + high[1]) / 2.0 + half)
     return png_of(figure)

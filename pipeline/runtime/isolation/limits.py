@@ -7,6 +7,7 @@ import math
 
 from pipeline.errors import SettingsError
 from pipeline.model import Reason
+from pipeline.options import ResourceOptions
 
 MIN_MEMORY_BYTES = 2**29
 """A child uses a quarter of this before it begins."""
@@ -25,9 +26,9 @@ class IsolationLimits:
         A limit is too small to model any building.
     """
 
-    timeout_s: float = 600.0
+    timeout_s: float = ResourceOptions.building_timeout_s
     """Wall-clock seconds of one building; protects the run."""
-    memory_bytes: int = 4 * 2**30
+    memory_bytes: int = round(ResourceOptions.building_memory_gib * 2**30)
     """Private resident size of the child process."""
 
     def __post_init__(self) -> None:

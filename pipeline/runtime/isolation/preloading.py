@@ -24,7 +24,7 @@ _STAGES = (
 )
 _LOADS = {
     "reconstruct": ("pipeline.runtime.stages.publish", "pipeline.export.tile", "pipeline.runtime.digest"),
-    "classify": ("pipeline.runtime.stages.label", "pipeline.runtime.stages.write_classified"),
+    "classify": ("pipeline.extras.classify.label", "pipeline.extras.classify.write_classified"),
 }
 _SCENE = "pipeline.runtime.stages.rehearsal:rehearse_scene"
 

@@ -18,6 +18,7 @@ import numpy.typing as npt
 import shapely
 
 from pipeline.model import BoolArray
+from pipeline.registry import extra
 from pipeline.runtime.plan import check_windows, ground_bytes, split_grid, tiles_per_block
 from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import Scratch
@@ -37,7 +38,7 @@ from pipeline.terrain.support import ROOFS_ALONE_CELLS
 from pipeline.tiling import MM, Tile, TileGrid, Window
 
 if TYPE_CHECKING:
-    from pipeline.runtime.stages.given_footprints import GivenFootprints, Outline
+    from pipeline.extras.footprints.given_footprints import GivenFootprints, Outline
 
 _ABOUT_ROOFS_ALONE = (
     "no points lie around given footprints with points on {} m2: the points there count as roof, not ground, and a "
@@ -240,9 +241,7 @@ def draw_ground(task: GroundTask, settings: GroundSettings) -> tuple[TileGround,
     column0, row0, columns, rows = lattice_of(inside)
     alone = np.zeros_like(occupied)
     if task.outlines:
-        from pipeline.terrain.roofs_alone import roofs_alone
-
-        alone = roofs_alone(lowest, occupied, corner, task.outlines)
+        alone = extra("roofs_alone")(lowest, occupied, corner, task.outlines)
         lowest[alone] = NO_DATA
         inner = (slice(wide, -wide), slice(wide, -wide))
         lowest, occupied, alone = lowest[inner], occupied[inner], alone[inner]

@@ -26,6 +26,7 @@ from pipeline.io.records import Share
 from pipeline.io.storage import sha256_of
 from pipeline.io.strays import MOST_STRAYS
 from pipeline.model import IntArray, PointCloud, Reason
+from pipeline.registry import extra
 from pipeline.runtime.isolation.limits import IsolationLimits, Loss
 from pipeline.runtime.plan import is_fetched_by_nodes, shares_of
 from pipeline.runtime.run_context import RunContext
@@ -233,9 +234,7 @@ def _ingest_here(task: IngestTask) -> Ingested:
         return _ingested(task)
     if task.known is not None and is_fetched_by_nodes(task.known, task.options):
         return dataclasses.replace(_ingested(task), path=shown(task.path))
-    from pipeline.io.remote_file import RemoteFile
-
-    file = RemoteFile(task.path)
+    file = extra("RemoteFile")(task.path)
     copy = task.scratch.path("fetched", uuid4().hex, f"points{file.suffix}")
     try:
         known = task.known if task.known is not None and task.known.is_of(file) else None

@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from pipeline.kernels.union_find import united
 from pipeline.model import BoolArray, IntArray
+from pipeline.registry import extra
 from pipeline.roof.settings import RoofSettings
 from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import Scratch
@@ -44,7 +45,7 @@ from pipeline.terrain.settings import CandidateSettings, SceneSettings
 from pipeline.tiling import Tile, TileGrid
 
 if TYPE_CHECKING:
-    from pipeline.runtime.stages.given_footprints import GivenFootprints
+    from pipeline.extras.footprints.given_footprints import GivenFootprints
 
 _STAGE = "join"
 _TILES_ACROSS = 8
@@ -275,10 +276,8 @@ def join(
     plan = context.plan
     crs_name = plan.reference.named
     if footprints is not None:
-        from pipeline.runtime.stages.footprint_sites import join_footprints
-
         with context.progress.stage(_STAGE, 1) as counter:
-            found = join_footprints(
+            found = extra("join_footprints")(
                 splits.stored(context),
                 plan.grid,
                 splits.numbers,

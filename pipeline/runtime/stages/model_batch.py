@@ -26,8 +26,8 @@ from pipeline.runtime.stages.sites import CandidateSite, StoredGroup
 from pipeline.tiling import TileGrid
 
 if TYPE_CHECKING:
+    from pipeline.extras.overrides.overrides_file import OwnModelling
     from pipeline.runtime.isolation.replay_bundle import Bundle, Incident
-    from pipeline.runtime.overrides.overrides_file import OwnModelling
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -12,6 +12,7 @@ from pipeline.errors import InputError
 from pipeline.io import shown
 from pipeline.methods import method_named
 from pipeline.model import IntArray
+from pipeline.registry import extra
 from pipeline.runtime.plan import Plan
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.run_context import RunContext
@@ -34,13 +35,9 @@ from pipeline.terrain.strip_moves import moves_of, offsets_of, strips_warning, s
 from pipeline.terrain.survey_strips import NO_ROWS, Rows, counted, rows_of
 
 if TYPE_CHECKING:
-    from pipeline.runtime.overrides.overrides_file import Override
-    from pipeline.runtime.stages.given_footprints import GivenFootprints
-    from pipeline.runtime.stages.given_guides import GivenGuides
-
-
-if TYPE_CHECKING:
-    from pipeline.runtime.stages.given_footprints import GivenFootprints
+    from pipeline.extras.footprints.given_footprints import GivenFootprints
+    from pipeline.extras.guides.given_guides import GivenGuides
+    from pipeline.extras.overrides.overrides_file import Override
 
 _STRIPS = "strips"
 """The stage under which it is stored how strips that were moved differ in the files."""
@@ -123,26 +120,24 @@ def footprints_for(request: RunRequest, plan: Plan) -> GivenFootprints | None:
     named = (request.footprints, request.footprints_layer)
     if named == (None, None) and not request.settings.footprints.columns:
         return None
-    from pipeline.runtime.stages.given_footprints import footprints_of_run
-
-    return footprints_of_run(request.footprints, plan, request.settings.footprints, request.footprints_layer)
+    given: GivenFootprints | None = extra("footprints_of_run")(
+        request.footprints, plan, request.settings.footprints, request.footprints_layer
+    )
+    return given
 
 
 def overrides_for(request: RunRequest, plan: Plan, settings: RunSettings) -> Sequence[Override]:
     """The overrides of a run."""
     if request.overrides is None:
         return ()
-    from pipeline.runtime.overrides.overrides_file import read_overrides
-
-    return read_overrides(request.overrides, plan.reference, settings)
+    read: Sequence[Override] = extra("read_overrides")(request.overrides, plan.reference, settings)
+    return read
 
 
 def guides_for(request: RunRequest, plan: Plan, variants: Sequence[RunSettings]) -> GivenGuides | None:
     """The guides of a run; None without a file. Raises InputError if they, or one of the methods, cannot be used."""
     if request.guides is None:
         return None
-    from pipeline.runtime.stages.given_guides import given_guides
-
     for one in variants:
         if not one.building.arranges(method_named(one.general.method)):
             raise InputError(
@@ -150,4 +145,5 @@ def guides_for(request: RunRequest, plan: Plan, variants: Sequence[RunSettings])
                 f"{one.general.method} traces roof faces from labelled points and takes no guides",
                 'Use faces = "arranged" or the method arrangement, or leave --guides out',
             )
-    return given_guides(request.guides, plan, variants[0].building.guides.kind_column)
+    given: GivenGuides | None = extra("given_guides")(request.guides, plan, variants[0].building.guides.kind_column)
+    return given

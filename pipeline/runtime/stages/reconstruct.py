@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.model import Status
+from pipeline.registry import extra
 from pipeline.runtime.monitoring.logs import LOG
 from pipeline.runtime.monitoring.measurement import TALLIES, Part, slow_building_s
 from pipeline.runtime.run_context import ProgressUnits, RunContext
@@ -21,8 +22,8 @@ from pipeline.settings import RunSettings
 from pipeline.tiling import Tile
 
 if TYPE_CHECKING:
-    from pipeline.runtime.overrides.overrides_file import Override, OwnModelling
-    from pipeline.runtime.stages.given_guides import GivenGuides
+    from pipeline.extras.guides.given_guides import GivenGuides
+    from pipeline.extras.overrides.overrides_file import Override, OwnModelling
 
 QUARANTINE = "quarantine"
 """Folder of a run directory, and of scratch, for the bundles of buildings that ended their process."""
@@ -150,9 +151,7 @@ def _own(overridden: Sequence[tuple[str, Override]], settings: RunSettings) -> d
     """Method and settings of the buildings that have their own, by building_id."""
     if not overridden:
         return {}
-    from pipeline.runtime.overrides.overrides_file import own_modelling
-
-    return {building_id: own_modelling(override, settings) for building_id, override in overridden}
+    return {building_id: extra("own_modelling")(override, settings) for building_id, override in overridden}
 
 
 def _tell(context: RunContext, model: Modelled) -> None:

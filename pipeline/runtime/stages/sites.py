@@ -18,7 +18,7 @@ from pipeline.terrain.candidates import Verdict
 from pipeline.tiling import MM, Tile, TileGrid, Window
 
 if TYPE_CHECKING:
-    from pipeline.runtime.overrides.overrides_file import Override
+    from pipeline.extras.overrides.overrides_file import Override
 
 UNITS = "units"
 """The stage under which the sites of tiles are stored, and the folder of scratch with the points of units."""

@@ -16,6 +16,7 @@ from shapely import MultiPolygon, Polygon
 
 from pipeline.kernels.sorting import radix_order
 from pipeline.model import IntArray
+from pipeline.registry import extra
 from pipeline.runtime.plan import split_grid, window_bytes
 from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import Scratch
@@ -33,7 +34,7 @@ from pipeline.terrain.settings import ClassesInUse, SceneSettings
 from pipeline.tiling import MM, Tile, TileGrid
 
 if TYPE_CHECKING:
-    from pipeline.runtime.stages.given_footprints import GivenFootprints, Outline
+    from pipeline.extras.footprints.given_footprints import GivenFootprints, Outline
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -93,10 +94,8 @@ def split(
     polygons: Sequence[Outline] = ()
     numbers: Mapping[Tile, Sequence[int]] = {}
     if footprints is not None:
-        from pipeline.runtime.stages.given_footprints import numbers_by_tile
-
         polygons = footprints.polygons
-        numbers = numbers_by_tile(tiles, plan.grid, polygons)
+        numbers = extra("numbers_by_tile")(tiles, plan.grid, polygons)
     # the fullest first, so that no long task is left for the end
     order = [tile for tile, _ in sorted(tiles.items(), key=lambda item: (-item[1], item[0]))]
     outlines = {tile: None if footprints is None else tuple(polygons[k] for k in numbers[tile]) for tile in order}

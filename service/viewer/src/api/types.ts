@@ -151,8 +151,6 @@ export interface Webhook {
   enabled: boolean;
   disabledReason?: string;
   created: string;
-  pausedSince?: string;
-  notSent?: number;
 }
 
 export interface EventKind {

@@ -8,7 +8,7 @@ import { announce, asProblem, problemNotice } from "../page/notices";
 import { fact, table } from "../page/tables";
 import type { Hooks, View } from "../page/view";
 import { Watching } from "../page/watching";
-import { count, counted } from "../words/numbers";
+import { count } from "../words/numbers";
 
 const REFRESH_MS = 2000;
 
@@ -32,23 +32,6 @@ export function deliveryRemedy(state: string): string {
     default:
       return "";
   }
-}
-
-interface ReceiverState {
-  enabled: boolean;
-  pausedSince?: string;
-  notSent?: number;
-}
-
-export function receiverState({ enabled, pausedSince }: ReceiverState): "enabled" | "paused" | "disabled" {
-  if (!enabled) return "disabled";
-  return pausedSince === undefined ? "enabled" : "paused";
-}
-
-/** What waits for a receiver, and what to do about it if it is paused; empty if nothing does. */
-export function unsentWords({ pausedSince, notSent = 0 }: ReceiverState): string {
-  if (pausedSince !== undefined) return `It did not keep up: ${counted(notSent, "message")} not sent. Mend it, then choose “Send what it missed”.`;
-  return notSent === 0 ? "" : `${counted(notSent, "message")} wait for it`;
 }
 
 /** The body as it reads best; as it was sent if it is not JSON. */

@@ -13,7 +13,7 @@ import { nothing, table } from "../page/tables";
 import type { Hooks, View } from "../page/view";
 import { Watching } from "../page/watching";
 import { ago } from "../words/numbers";
-import { DELIVERY_WORDS, receiverState, showDelivery, unsentWords } from "./delivery_view";
+import { DELIVERY_WORDS, showDelivery } from "./delivery_view";
 import "../page/pages.css";
 
 const SIZE = 25;
@@ -121,8 +121,6 @@ class Webhooks implements View {
       { label: "Remove…", act: () => this.remove(one, path) },
     ];
     const name = one.description ?? one.url;
-    const state = receiverState(one);
-    const unsent = unsentWords(one);
     return el(
       "tr",
       {},
@@ -137,8 +135,7 @@ class Webhooks implements View {
       el(
         "td",
         {},
-        el("span", { class: `chip ${state === "enabled" ? "chip-good" : "chip-warn"}` }, state),
-        unsent === "" ? null : el("span", { class: "sub" }, unsent),
+        el("span", { class: `chip ${one.enabled ? "chip-good" : "chip-warn"}` }, one.enabled ? "enabled" : "disabled"),
         one.disabledReason === undefined ? null : el("span", { class: "sub" }, one.disabledReason),
       ),
       el("td", { class: "acts" }, actionMenu(name, () => items, this.hooks.onProblem)),

@@ -1,0 +1,1 @@
+"""What only some runs ask for: one folder each, loaded through the tables that name it."""

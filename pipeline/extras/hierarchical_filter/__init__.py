@@ -1,0 +1,1 @@
+"""The hierarchical ground filter."""

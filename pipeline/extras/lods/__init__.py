@@ -1,0 +1,1 @@
+"""Other levels of detail."""

@@ -1,0 +1,1 @@
+"""3D Tiles on the globe."""

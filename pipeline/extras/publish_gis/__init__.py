@@ -1,0 +1,1 @@
+"""GeoPackage and PMTiles."""

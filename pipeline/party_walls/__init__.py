@@ -1,1 +1,0 @@
-"""Party walls: where walls of two buildings touch, and what is left of each wall."""

@@ -1,1 +1,0 @@
-"""Overrides: manual corrections of single buildings."""

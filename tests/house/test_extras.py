@@ -1,0 +1,27 @@
+"""Extras: each is a folder that says what it is, and every name of the table leads to something."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+import pipeline.extras
+from pipeline.registry import EXTRAS, extra
+
+FOLDERS = sorted(path for path in Path(pipeline.extras.__file__).parent.iterdir() if list(path.glob("*.py")))
+
+
+@pytest.mark.parametrize("name", EXTRAS)
+def test_what_the_core_asks_for_by_name_is_there(name: str) -> None:
+    assert isinstance(extra(name), Callable)
+
+
+@pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
+def test_each_extra_says_what_it_adds_and_where_it_enters(folder: Path) -> None:
+    readme = (folder / "README.md").read_text()
+    assert readme.startswith("# ")
+    assert "\nEntry: " in readme
+
+
+def test_the_table_names_no_folder_that_is_not_an_extra() -> None:
+    assert {place.partition(".")[0] for place in EXTRAS.values()} <= {folder.name for folder in FOLDERS}
