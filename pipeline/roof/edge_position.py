@@ -23,7 +23,7 @@ import numpy as np
 import shapely
 
 from pipeline.compiler import kernel
-from pipeline.kernels.bounds import bounds_of
+from pipeline.geometry import bounds_of
 from pipeline.kernels.exact_sum import exact_sum
 from pipeline.kernels.sorting import counting_sort, in_order, sort_few
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray

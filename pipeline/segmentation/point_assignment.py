@@ -142,25 +142,6 @@ def vote_among_neighbours(
 
 
 @kernel
-def nearest_plane(points: FloatArray, planes: FloatArray, usable: BoolArray, distance_m: float) -> LabelArray:
-    """The nearest of all planes within the distance: the paper's merging of points with planes.
-
-    Returns (n,) int32, -1 for none; parameters as for `vote_among_neighbours`.
-    """
-    labels = np.full(points.shape[0], -1, np.int32)
-    for i in range(points.shape[0]):
-        least = distance_m
-        for k in range(usable.size):
-            if not usable[k]:
-                continue
-            distance = distance_to_plane(points, i, planes, k)
-            if distance < least or (distance == least and labels[i] < 0):
-                least = distance
-                labels[i] = k
-    return labels
-
-
-@kernel
 def touching_pairs(neighbours: LabelArray, labels: LabelArray, usable: BoolArray) -> IntArray:
     """Codes low * n + high of all pairs of usable clusters that occur together among one point and its neighbours.
 

@@ -13,7 +13,6 @@ import pytest
 from points_glb import read_points_glb
 from starlette.testclient import TestClient
 
-
 GABLE = runs.ident("gable")
 
 

@@ -14,7 +14,7 @@ from pipeline.extras.papers.leftover_planes import cluster_leftovers
 from pipeline.extras.papers.ridge_snapping import find_ridges, label_by_ridges
 from pipeline.model import FloatArray, LabelArray
 from pipeline.segmentation.plane_refinement import refine_planes
-from pipeline.segmentation.plane_settings import PlaneRefinementSettings
+from pipeline.segmentation.refinement_settings import PlaneRefinementSettings
 
 
 def planes_of_clusters(

@@ -23,7 +23,7 @@ from pipeline.segmentation.plane_regression import (
     has_company,
     height_above,
 )
-from pipeline.segmentation.plane_settings import RegionGrowingSettings
+from pipeline.segmentation.refinement_settings import RegionGrowingSettings
 
 WORK_LIMIT = 1_000_000_000
 """Looks at neighbours after which a building is too complex: points that hold no region are grown over once a seed."""

@@ -14,7 +14,7 @@ from pipeline.extras.papers.clustering_settings import (
     SingleLinkageSettings,
 )
 from pipeline.parameters import Parameters, parameter
-from pipeline.segmentation.plane_settings import PlaneRefinementSettings, RegionGrowingSettings
+from pipeline.segmentation.refinement_settings import PlaneRefinementSettings, RegionGrowingSettings
 
 
 class RoofFaceSettings(Parameters):

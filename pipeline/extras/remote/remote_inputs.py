@@ -11,8 +11,9 @@ from pipeline.extras.remote.remote_file import RemoteFile
 from pipeline.extras.remote.retries import GaveUpError, persistently
 from pipeline.extras.remote.urls import filesystem_of, scheme_of
 from pipeline.extras.vector_files.tile_index import TileIndex, read_tile_index
-from pipeline.io.formats import is_index, point_files
+from pipeline.io.formats import is_index
 from pipeline.io.locations import shown
+from pipeline.io.point_folders import point_files
 
 
 def files_at(url: str, cut: Callable[[TileIndex], Sequence[str]]) -> list[str]:

@@ -17,8 +17,7 @@ from pipeline.kernels.sorting import ascending_order, counting_sort
 from pipeline.kernels.union_find import numbered_sets, unite
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
 from pipeline.roof.arrangement.guide_lines import length_on_guide
-from pipeline.roof.arrangement.limits import Limits
-from pipeline.roof.arrangement.raster_labels import COST_SCALE, vertical_distance_m
+from pipeline.roof.arrangement.raster_labels import COST_SCALE, Limits, vertical_distance_m
 from pipeline.roof.arrangement.subdivision import CELLS, EDGES, FACE, LINE, ORIGIN, Subdivision, between_vertices
 
 _MIN_BEYOND = 3.0

@@ -19,8 +19,7 @@ import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
-from pipeline.roof.arrangement.limits import Limits
-from pipeline.roof.arrangement.raster_labels import COST_SCALE, vertical_distance_m
+from pipeline.roof.arrangement.raster_labels import COST_SCALE, Limits, vertical_distance_m
 from pipeline.roof.arrangement.subdivision import (
     CELLS,
     EDGES,

@@ -17,9 +17,8 @@ import numpy as np
 from pipeline.compiler import kernel
 from pipeline.kernels.sorting import ascending_order
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
-from pipeline.roof.arrangement.limits import Limits
 from pipeline.roof.arrangement.movable_borders import Borders
-from pipeline.roof.arrangement.raster_labels import vertical_distance_m
+from pipeline.roof.arrangement.raster_labels import Limits, vertical_distance_m
 
 _FEWEST_POINTS = 6
 """Planes with fewer points keep their coefficients: twice as many as there are coefficients."""

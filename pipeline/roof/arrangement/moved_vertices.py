@@ -13,7 +13,6 @@ import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.model import FloatArray, IntArray
-from pipeline.roof.arrangement.limits import Limits
 from pipeline.roof.arrangement.movable_borders import (
     KEEPS,
     MAX_DEGREE,
@@ -24,6 +23,7 @@ from pipeline.roof.arrangement.movable_borders import (
     ends_at_vertices,
     star_is_sound,
 )
+from pipeline.roof.arrangement.raster_labels import Limits
 
 _ROUNDS = 2
 """Turns through all vertices: a vertex may be free to move once its neighbour has moved."""
