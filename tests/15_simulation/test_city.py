@@ -19,7 +19,6 @@ from pipeline.model import FloatArray
 from pipeline.ruler.evaluation.reading import read_models
 from pipeline.ruler.simulation.als import ScanBlock, scan_all
 from pipeline.ruler.simulation.city import CITY_SCANNER, CityPlan, city
-from pipeline.ruler.simulation.conditions import terrain_slope_deg
 from pipeline.ruler.simulation.dataset import ScenePaths, simulate, tile_extents
 from pipeline.ruler.simulation.scene import Defect, Scene
 from pipeline.ruler.simulation.strips import reached
@@ -191,7 +190,7 @@ def test_a_square_kilometre_has_all_kinds_of_things_and_a_steep_hillside() -> No
         "superstructure",
         "overhanging_tree",
     }
-    slopes = np.array([terrain_slope_deg(scene.terrain, one.x, one.y) for one in scene.buildings])
+    slopes = np.array([scene.terrain.slope_deg(one.x, one.y) for one in scene.buildings])
     assert 25.0 < slopes.max() < 30.0
     assert np.median(slopes) < 5.0
     assert len(scene.trees) > 1_000

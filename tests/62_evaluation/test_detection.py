@@ -17,9 +17,6 @@ from pipeline.ruler.evaluation.building_raster import (
     CellWindow,
     PlanRaster,
     PointRaster,
-    dilated,
-    edge_ring,
-    eroded,
     outlines_of,
     windows_of,
 )
@@ -62,15 +59,6 @@ EXTENT = shapely.box(980, 1980, 1300, 2100)
 
 
 # ------------------------------------------------------------------------------------------------------------ raster
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_the_steps_are_those_of_scipy(seed: int) -> None:
-    cells = np.random.default_rng(seed).random((40, 50)) < 0.5
-    assert (dilated(cells) == ndimage.binary_dilation(cells, CROSS)).all()
-    assert (eroded(cells) == ndimage.binary_erosion(cells, CROSS, border_value=1)).all()
-    ring = ndimage.binary_dilation(cells, CROSS) & ~ndimage.binary_erosion(cells, CROSS, border_value=1)
-    assert (edge_ring(cells) == ring).all()
 
 
 def plain_raster(xyz: FloatArray, is_building: BoolArray, window: CellWindow) -> BoolArray:

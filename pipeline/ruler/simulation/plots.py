@@ -9,7 +9,7 @@ import numpy as np
 
 from pipeline.model import FloatArray
 from pipeline.ruler.simulation.roofs import ROOFS, RoofDimensions, RoofShape
-from pipeline.ruler.simulation.scene import turned
+from pipeline.ruler.simulation.scene import Building, Terrain, place_building, turned
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -42,6 +42,18 @@ class PlannedBuilding:
         """Lowest and highest corner (2,) of the turned roof's box about the middle of the main rectangle."""
         plan = turned(ROOFS[self.shape](self.dimensions).vertices[:, :2], 0.0, 0.0, self.azimuth_deg)
         return plan.min(axis=0), plan.max(axis=0)
+
+    def built(self, building_id: str, plot: Plot, eave_height_m: float, terrain: Terrain) -> Building:
+        """The building on its plot."""
+        return place_building(
+            building_id,
+            self.shape,
+            self.dimensions,
+            at=(plot.x, plot.y),
+            azimuth_deg=self.azimuth_deg,
+            eave_height_m=eave_height_m,
+            terrain=terrain,
+        )
 
 
 def packed_plots(
