@@ -10,7 +10,6 @@ from epochs_by_hand import ORIGIN, by_name, compared, failed, house, write_epoch
 
 from pipeline.model import BuildingResult
 from pipeline.ruler.epochs import comparing, matching
-from pipeline.ruler.epochs.settings import DiffSettings
 from pipeline.ruler.simulation.roofs import RoofShape
 
 MIRRORED = {
@@ -172,8 +171,3 @@ def test_parts_hold_every_place_once_and_do_not_depend_on_the_order() -> None:
     turned = random.permutation(541)
     again = [sorted(turned[part].tolist()) for part in matching.parts_of(places[turned], 25)]
     assert again == [sorted(part) for part in parts]
-
-
-def test_settings_are_mirrored_by_their_shift_alone() -> None:
-    settings = DiffSettings(vertical_shift_m=0.4)
-    assert settings.swapped() == DiffSettings(vertical_shift_m=-0.4)
