@@ -32,13 +32,9 @@ class MapClass:
     """One class."""
 
     name: str
-    """Its name in the rows."""
     label: str
-    """Its label in the legend."""
     colour: str
-    """As #rrggbb."""
     hatched: bool = False
-    """Whether it is hatched."""
 
 
 class ClassMap:

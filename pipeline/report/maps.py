@@ -41,13 +41,9 @@ class Entry:
     """A line of a legend."""
 
     label: str
-    """Label."""
     colour: str
-    """As #rrggbb."""
     count: int
-    """Number."""
     hatched: bool = False
-    """Whether it is hatched."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -55,21 +51,13 @@ class Map:
     """A map with its words."""
 
     title: str
-    """Title."""
     png: bytes
-    """The picture."""
     width_px: int
-    """Its width."""
     height_px: int
-    """Its height."""
     legend: tuple[Entry, ...]
-    """Meanings of the colours that occur."""
     is_half: bool
-    """Whether half the width of a page is enough."""
     scale_label: str
-    """Length of the scale bar."""
     scale_share: float
-    """That length as a share of the picture's width."""
 
     @property
     def description(self) -> str:
@@ -82,9 +70,7 @@ class Layer:
     """Polygons of one colour."""
 
     entry: Entry
-    """Its line of the legend."""
     geometries: Sequence[Any]
-    """Polygons."""
     filled: bool = True
     """False: outlines with a hatch."""
 

@@ -71,13 +71,9 @@ class Epoch:
     name: str
     """OLD or NEW, for messages."""
     run_dir: str
-    """Path or URL."""
     manifest: RunManifest
-    """Its manifest."""
     reference: SpatialReference
-    """CRS and units."""
     coverage: Coverage
-    """Where it has data."""
     boxes: FloatArray
     """(n, 4) float64, bounds of all footprints in metres: west, south, east, north; nan without geometry."""
     files: IntArray
@@ -93,7 +89,6 @@ class Epoch:
     schemas: tuple[pa.Schema, pa.Schema]
     """Schemas of the tables of buildings and of planes."""
     table: pads.Dataset
-    """The table of buildings."""
 
     def __len__(self) -> int:
         """Number of buildings."""

@@ -37,9 +37,7 @@ class CellWindow:
     column: int
     """First column; columns grow east."""
     rows: int = WINDOW_CELLS
-    """Number of rows."""
     columns: int = WINDOW_CELLS
-    """Number of columns."""
 
     def grown(self, cells: int) -> CellWindow:
         """With a margin on all sides."""

@@ -49,9 +49,7 @@ class Line:
     """One measure of one subset, ready to print."""
 
     definition: Definition
-    """What it is."""
     measure: Measure
-    """The figures."""
     value: str
     """`93.4 %`, `0.052 m`; a dash for a missing figure."""
     interval: str
@@ -75,9 +73,7 @@ class Chapter:
     """The measures of one group."""
 
     group: Group
-    """Which."""
     title: str
-    """Its title."""
     lines: tuple[Line, ...]
     """In the order of the measures; the subsets of one measure follow one another."""
     tables: tuple[CountTable, ...]

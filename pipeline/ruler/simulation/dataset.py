@@ -57,11 +57,9 @@ class ScenePaths:
     labels: Path
     """Per-point truth, or the folder of it for several tiles."""
     points: int
-    """Returns in all tiles."""
     buildings: int
     """Buildings in the scene, or in all cells together."""
     tiles: int = 1
-    """LAZ files."""
     cells: tuple[ScenePaths, ...] = ()
     """The files of every cell of a suite of several surveys."""
 

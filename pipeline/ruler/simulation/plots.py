@@ -19,7 +19,6 @@ class Plot:
     x: float
     """Easting of the middle of the building's main rectangle, scene frame."""
     y: float
-    """Northing of the same."""
     extent: tuple[float, float, float, float]
     """The plot: smallest x, smallest y, largest x, largest y."""
 
@@ -29,13 +28,10 @@ class PlannedBuilding:
     """A building before it has a place."""
 
     shape: RoofShape
-    """The parametric shape."""
     dimensions: RoofDimensions
-    """Its size."""
     azimuth_deg: float
     """Direction of the ridge, clockwise from north."""
     margin_m: float
-    """Free ground around it."""
 
     @property
     def bounds(self) -> tuple[FloatArray, FloatArray]:

@@ -39,15 +39,12 @@ class Suite:
     name: str
     """As given on the command line."""
     summary: str
-    """One sentence."""
     make: Callable[[int, tuple[float, float]], Scene]
     """Scene from a seed and a size in metres."""
     scanner: ScannerSettings
-    """Default survey."""
     size_m: tuple[float, float]
     """Default extent east and north."""
     seed: int = 1
-    """Default seed."""
     is_sized: bool = True
     """False if the extent follows from the buildings; `size_m` is then an approximate result, not an input."""
     returns: Returns = Returns.ALL
