@@ -11,7 +11,7 @@ import pyarrow as pa
 import shapely
 
 from pipeline.model import BoolArray, FloatArray, Status
-from pipeline.report.maps import BAD, DOUBTFUL, FAIR, GOOD, MISSING, UNJUDGED, Entry, Layer, Map, draw_map
+from pipeline.report.maps import BAD, DOUBTFUL, FAIR, GOOD, MISSING, UNJUDGED, Entry, Map, draw_map
 from pipeline.ruler.evaluation.counts import flags, visible_share
 from pipeline.ruler.evaluation.evaluate import Evaluation
 
@@ -42,13 +42,10 @@ def maps(evaluation: Evaluation) -> list[Map]:
     return [one for one in made if one is not None]
 
 
-def _layer(
-    label: str, colour: str, geometries: Sequence[Any], chosen: Any, *, filled: bool = True, hatched: bool = False
-) -> Layer:
+def _layer(label: str, colour: str, geometries: Sequence[Any], chosen: Any, *, hatched: bool = False) -> Entry:
     """The chosen geometries."""
     picked = [geometry for geometry, is_so in zip(geometries, chosen, strict=True) if is_so]
-    entry = Entry(label=label, colour=colour, count=len(picked), hatched=hatched or not filled)
-    return Layer(entry=entry, geometries=picked, filled=filled)
+    return Entry(label, colour, len(picked), hatched, picked)
 
 
 def _missing(buildings: pa.Table) -> BoolArray:
@@ -63,10 +60,10 @@ def _found(buildings: pa.Table) -> BoolArray:
     return found
 
 
-def _torn(buildings: pa.Table, geometries: Sequence[Any]) -> Layer:
+def _torn(buildings: pa.Table, geometries: Sequence[Any]) -> Entry:
     """Buildings under models of which none stands for them, hatched over the colour of what these models found."""
     chosen = ~_found(buildings) & ~_missing(buildings) & ~_cut(buildings)
-    return _layer("wrongly divided or joined: no model stands for it", MISSING, geometries, chosen, filled=False)
+    return _layer("wrongly divided or joined: no model stands for it", MISSING, geometries, chosen, hatched=True)
 
 
 def _cut(buildings: pa.Table) -> BoolArray:
@@ -75,7 +72,7 @@ def _cut(buildings: pa.Table) -> BoolArray:
     return flags(buildings, "touches_data_edge") if known else np.zeros(buildings.num_rows, bool)
 
 
-def _outcome_layers(buildings: pa.Table, geometries: Sequence[Any]) -> list[Layer]:
+def _outcome_layers(buildings: pa.Table, geometries: Sequence[Any]) -> list[Entry]:
     """Correct, passable, false, not found, not judged."""
     missing = _missing(buildings)
     outcomes = np.array(buildings["outcome"].to_pylist(), object)
@@ -91,7 +88,7 @@ def _outcome_layers(buildings: pa.Table, geometries: Sequence[Any]) -> list[Laye
     return [*layers, _torn(buildings, geometries)]
 
 
-def _share_layers(buildings: pa.Table, shares: FloatArray, geometries: Sequence[Any]) -> list[Layer]:
+def _share_layers(buildings: pa.Table, shares: FloatArray, geometries: Sequence[Any]) -> list[Entry]:
     """Classes of the share (n,) of top-visible points within 0.2 m."""
     missing, unjudged = _missing(buildings), np.isnan(shares) | _cut(buildings)
     layers = [_layer("not judged (no points, or cut by the edge of the data)", UNJUDGED, geometries, unjudged)]
@@ -104,7 +101,7 @@ def _share_layers(buildings: pa.Table, shares: FloatArray, geometries: Sequence[
     return [*layers, _layer("not found", MISSING, geometries, ~unjudged & missing), _torn(buildings, geometries)]
 
 
-def _found_layers(buildings: pa.Table, geometries: Sequence[Any]) -> list[Layer]:
+def _found_layers(buildings: pa.Table, geometries: Sequence[Any]) -> list[Entry]:
     layers = [
         _layer("found", GOOD, geometries, _found(buildings)),
         _layer("not found", MISSING, geometries, _missing(buildings)),
@@ -112,7 +109,7 @@ def _found_layers(buildings: pa.Table, geometries: Sequence[Any]) -> list[Layer]
     return [*layers, _torn(buildings, geometries)]
 
 
-def _false_models(evaluation: Evaluation) -> Layer:
+def _false_models(evaluation: Evaluation) -> Entry:
     """Models where no building is, hatched."""
     table = evaluation.tables.get("models")
     chosen = set()
@@ -121,10 +118,10 @@ def _false_models(evaluation: Evaluation) -> Layer:
         chosen = {name for name, role in roles if role == "false"}
     models = evaluation.models.models
     is_false = [model.building_id in chosen for model in models]
-    return _layer("model without a building", BAD, [m.footprint for m in models], is_false, filled=False)
+    return _layer("model without a building", BAD, [m.footprint for m in models], is_false, hatched=True)
 
 
-def _status_layers(evaluation: Evaluation) -> list[Layer]:
+def _status_layers(evaluation: Evaluation) -> list[Entry]:
     """The models alone: ok, doubtful, fallback, failed."""
     models, failed = evaluation.models.models, evaluation.models.failed
     footprints = [model.footprint for model in models]
@@ -142,7 +139,7 @@ def _status_layers(evaluation: Evaluation) -> list[Layer]:
     ]
 
 
-def _face_layers(faces: pa.Table, model_faces: pa.Table | None) -> list[Layer]:
+def _face_layers(faces: pa.Table, model_faces: pa.Table | None) -> list[Entry]:
     """Found, missed, not to be found; wrong ones of the models hatched over them."""
     geometries = shapely.from_wkb(np.array(faces["geometry"].to_pylist(), dtype=object))
     found = flags(faces, "found")
@@ -156,5 +153,5 @@ def _face_layers(faces: pa.Table, model_faces: pa.Table | None) -> list[Layer]:
     if model_faces is not None and {"wrong", "geometry"} <= set(model_faces.column_names):
         made = shapely.from_wkb(np.array(model_faces["geometry"].to_pylist(), dtype=object))
         wrong = flags(model_faces, "wrong")
-        layers.append(_layer("modelled face that matches none", BAD, made, wrong, filled=False))
+        layers.append(_layer("modelled face that matches none", BAD, made, wrong, hatched=True))
     return layers
