@@ -5,6 +5,7 @@ Ordinary buildings lie beneath; the others are drawn over them one by one, so a 
 
 from __future__ import annotations
 
+import dataclasses
 from collections import Counter
 from collections.abc import Mapping
 from typing import Any
@@ -80,8 +81,10 @@ class ClassMap:
                 rows = table.filter(pc.equal(table["class"], name))["geometry"].to_pylist()
                 shown[name] = shapely.from_wkb(np.array(rows, dtype=object))
         layers = [
-            self._classes[name]._replace(
-                count=self._count[name], geometries=shapely.transform(geometries, lambda xy: xy * unit_m).tolist()
+            dataclasses.replace(
+                self._classes[name],
+                count=self._count[name],
+                geometries=shapely.transform(geometries, lambda xy: xy * unit_m).tolist(),
             )
             for name, geometries in shown.items()
         ]

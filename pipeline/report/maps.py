@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import shapely
@@ -36,7 +36,8 @@ NO_FIGURE = "-"
 """Shown for a missing figure."""
 
 
-class Entry(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class Entry:
     """A line of a legend, and the polygons that have its colour, or are hatched with it."""
 
     label: str
@@ -88,7 +89,7 @@ def draw_map(title: str, layers: Sequence[Entry]) -> Map | None:
         png=png_of(figure),
         width_px=width_px,
         height_px=height_px,
-        legend=tuple(layer._replace(geometries=()) for layer in drawn),
+        legend=tuple(dataclasses.replace(layer, geometries=()) for layer in drawn),
         is_half=is_half,
         scale_label=f"{length_m / 1000.0:g} km" if length_m >= 1000.0 else f"{length_m:g} m",
         scale_share=length_m / width_m,

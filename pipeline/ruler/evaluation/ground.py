@@ -157,7 +157,7 @@ def matched_points(
     is_first = np.append(True, (np.diff(keys[order], axis=0) != 0).any(axis=1))[: len(order)]
     start = np.flatnonzero(is_first)[np.cumsum(is_first) - 1]
     is_offered = order >= len(a)
-    wanted_before = np.cumsum(~is_offered) - ~is_offered
+    wanted_before: IntArray = np.cumsum(~is_offered) - ~is_offered
     partner = np.full(len(order), -1, np.int64)
     pair = place - (wanted_before - wanted_before[start])  # the first offered one goes to the first wanted one
     partner[pair[is_offered]] = order[is_offered] - len(a)
