@@ -3,7 +3,9 @@
 import { currentKey, getJson, keepKey, Problem } from "./api/requests";
 import { JobList } from "./jobs/job_list";
 import { partsOf, placeOf } from "./page/address";
+import { openForm, type Opened } from "./page/dialogs";
 import { byId, el } from "./page/elements";
+import { field } from "./page/form_fields";
 import { problemNotice } from "./page/notices";
 import type { View } from "./page/view";
 import { welcome } from "./page/welcome";
@@ -15,7 +17,7 @@ import "./frame.css";
 const main = byId("main");
 const jobs = new JobList(byId("jobs"), onProblem);
 new Submission(byId("submission"), (jobId) => {
-  void jobs.refresh();
+  jobs.refresh();
   location.hash = `#/jobs/${jobId}`;
 }, onProblem);
 
@@ -46,7 +48,7 @@ function route(): void {
   shown = now;
   view = null;
   main.scrollTop = 0;
-  const hooks = { onChange: () => void jobs.refresh(), onProblem };
+  const hooks = { onChange: () => jobs.refresh(), onProblem };
   if (place !== null) {
     leave = showJob(main, place, hooks);
   } else if (isView) {
@@ -64,48 +66,33 @@ function onProblem(problem: Problem): void {
   if (problem.status === 401) askForKey(problem);
 }
 
-const dialog = byId<HTMLDialogElement>("key-dialog");
+let asking: Opened | null = null;
 
 function askForKey(problem: Problem | null): void {
-  if (dialog.open) return;
+  if (asking?.element.isConnected === true) return;
   if (problem !== null && currentKey() !== null) {
     problem = new Problem(problem.status, "This key is not valid", "It may be mistyped or revoked.", problem.remedy);
   }
-  const field = el("input", {
-    id: "key-field",
-    type: "password",
-    autocomplete: "off",
-    spellcheck: "false",
-    "aria-describedby": "key-hint",
+  const key = el("input", { id: "key-field", type: "password", autocomplete: "off", spellcheck: "false" });
+  key.value = currentKey() ?? "";
+  asking = openForm("Key of this service", {
+    content: [
+      problem === null ? null : problemNotice(problem),
+      field("Your key", key, "It begins with gw_. This tab forgets it when you close it."),
+    ],
+    send: "Use this key",
+    act: async () => {
+      keepKey(key.value);
+      location.reload();
+    },
+    onProblem,
   });
-  field.value = currentKey() ?? "";
-  const form = el(
-    "form",
-    { method: "dialog" },
-    el("h2", { id: "key-title" }, "Key of this service"),
-    problem === null ? null : problemNotice(problem),
-    el("label", { for: "key-field" }, "Your key"),
-    field,
-    el("p", { class: "hint", id: "key-hint" }, "It begins with gw_. This tab forgets it when you close it."),
-    el(
-      "div",
-      { class: "actions" },
-      el("button", { type: "button", class: "quiet", onclick: () => dialog.close() }, "Cancel"),
-      el("button", { type: "submit", class: "primary" }, "Use this key"),
-    ),
-  );
-  form.addEventListener("submit", () => {
-    keepKey(field.value);
-    location.reload();
-  });
-  dialog.replaceChildren(form);
-  dialog.showModal();
 }
 
 byId("key-button").addEventListener("click", () => askForKey(null));
 window.addEventListener("hashchange", route);
 route();
-void jobs.start();
+jobs.refresh();
 void getJson("processes/reconstruct").catch((error: unknown) => {
   if (error instanceof Problem) onProblem(error);
 });

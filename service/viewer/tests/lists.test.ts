@@ -1,7 +1,7 @@
 import { describe, expect, test } from "vitest";
 import { hashOf, partsOf } from "../src/page/address";
 import { offsetOf, pageWords } from "../src/page/paging";
-import { bodyText, deliveryRemedy, receiverState, unsentWords } from "../src/service/delivery_view";
+import { bodyText, receiverState, unsentWords } from "../src/service/delivery_view";
 import { clockWords, countWords, slotWords, tileLines, withTiles } from "../src/service/schedules";
 
 describe("addresses of lists", () => {
@@ -61,11 +61,6 @@ describe("schedules", () => {
 });
 
 describe("messages", () => {
-  test("that did not arrive have a remedy, the others have none", () => {
-    for (const state of ["failed", "gone", "dropped"]) expect(deliveryRemedy(state)).not.toBe("");
-    for (const state of ["waiting", "delivered"]) expect(deliveryRemedy(state)).toBe("");
-  });
-
   test("that wait for a receiver are counted, and a receiver that is paused says what to do", () => {
     const pausedSince = "2026-03-01T09:30:00.000Z";
     expect(receiverState({ enabled: true })).toBe("enabled");

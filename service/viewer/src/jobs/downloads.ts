@@ -1,5 +1,6 @@
 import { currentKey, getJson, ofRun, request, serviceUrl } from "../api/requests";
 import type { Link } from "../api/types";
+import { dropDown } from "../page/action_menu";
 import { el } from "../page/elements";
 import { asProblem, problemNotice } from "../page/notices";
 import { bytes, counted } from "../words/numbers";
@@ -95,22 +96,7 @@ export async function downloadMenu(
   const list = await downloadList(jobPath, method, signal);
   const { ok = 0, ...others } = statuses;
   if (ok > 0 && Object.values(others).some((count) => count > 0)) list.prepend(onlyOk(list, ok, jobPath, method, signal));
-  list.classList.add("menu-list");
-  const menu = el(
-    "details",
-    { class: "menu" },
-    el("summary", { class: "button primary" }, "Download"),
-    list,
-  );
-  menu.addEventListener("keydown", (event) => {
-    if (event.key !== "Escape") return;
-    menu.open = false;
-    menu.querySelector("summary")?.focus();
-  });
-  document.addEventListener("pointerdown", (event) => {
-    if (!menu.contains(event.target as Node)) menu.open = false;
-  }, { signal });
-  return menu;
+  return dropDown(el("summary", { class: "button primary" }, "Download"), list);
 }
 
 /** A switch between the outputs of all buildings and those of the ones that are ok. */

@@ -7,22 +7,19 @@ import { hashOf } from "../page/address";
 import { ask } from "../page/dialogs";
 import { announce } from "../page/notices";
 import type { Hooks } from "../page/view";
-import { MODELLED, titleOf } from "./job_words";
+import { hasModels, titleOf } from "./job_words";
 
 /** A menu of all of it. */
 export function jobMenu(job: StatusInfo, hooks: Hooks): HTMLElement {
   let now = job;
   const items = (): Item[] => {
     const over = isOver(now.status);
-    const keeping = {
-      label: now.keep === true ? "No longer keep it" : "Keep it",
-      act: async () => {
-        now = await keep(now, hooks);
-      },
+    const keeping = async (): Promise<void> => {
+      now = await keep(now, hooks);
     };
     return [
       ...(over ? [{ label: "Try again…", act: () => retry(now, hooks) }] : []),
-      keeping,
+      { label: now.keep === true ? "No longer keep it" : "Keep it", act: keeping },
       ...comparing(now),
       { label: "Repeat on a schedule…", href: hashOf(["schedules", "new"], { job: now.jobID }) },
       { label: "Messages about it", href: hashOf(["webhooks"], { job: now.jobID }) },
@@ -36,7 +33,7 @@ export function jobMenu(job: StatusInfo, hooks: Hooks): HTMLElement {
 
 /** The way to the models of two runs side by side, of those of a comparison or of another job. */
 function comparing(job: StatusInfo): Item[] {
-  if (job.status !== "successful" || !MODELLED.has(job.processID ?? "reconstruct")) return [];
+  if (job.status !== "successful" || !hasModels(job)) return [];
   const [oldMethod = "", newMethod = ""] = Object.keys(job.summary?.runs ?? {});
   if (newMethod === "") return [{ label: "Compare with another…", href: hashOf(["changes"], { old: job.jobID }) }];
   return [{ label: "Two methods in 3D", href: hashOf(["changes"], { old: job.jobID, oldMethod, new: job.jobID, newMethod }) }];
@@ -76,10 +73,8 @@ export async function cancellation(job: StatusInfo, hooks: Hooks): Promise<void>
   };
   const status = await look();
   if (status !== "running") return stop(status);
-  ask({
-    title: "Cancel the job?",
-    text: `“${titleOf(job)}” is running. What it has done so far is lost.`,
-    yes: "Cancel the job",
+  ask("Cancel the job?", `“${titleOf(job)}” is running. What it has done so far is lost.`, {
+    send: "Cancel the job",
     act: async () => stop(await look()), // it may have ended before the answer
     onProblem: hooks.onProblem,
   });
@@ -87,10 +82,8 @@ export async function cancellation(job: StatusInfo, hooks: Hooks): Promise<void>
 
 /** Ask, then remove a job with its results; the page leaves it if it shows it. */
 function removal(job: StatusInfo, hooks: Hooks): void {
-  ask({
-    title: "Remove the job?",
-    text: `“${titleOf(job)}” and its results are removed from the service. Files that you have downloaded stay.`,
-    yes: "Remove it",
+  ask("Remove the job?", `“${titleOf(job)}” and its results are removed from the service. Files that you have downloaded stay.`, {
+    send: "Remove it",
     act: async () => {
       await request(pathOfJob(job.jobID), { method: "DELETE" });
       announce("The job is removed.");

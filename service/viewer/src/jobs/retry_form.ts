@@ -39,8 +39,7 @@ export async function openRetry(job: StatusInfo, hooks: Hooks): Promise<void> {
   const [first, more] = [true, false].map((isFirst) =>
     fields.filter(({ name }) => FIRST.includes(name) === isFirst).map(({ element }) => element),
   );
-  openForm({
-    title: "Try again",
+  openForm("Try again", {
     content: [
       el("p", {}, `A new job with the files of “${titleOf(job)}”. What you do not change stays as it was.`),
       ...(first ?? []),

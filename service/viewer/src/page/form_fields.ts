@@ -18,6 +18,15 @@ export function choice(id: string, options: Record<string, string>, chosen?: str
   return el("select", { id }, ...Object.entries(options).map(([value, label]) => el("option", { value, selected: value === chosen }, label)));
 }
 
+/** A form whose fields filter a list; it searches when one of them was changed. */
+export function searchForm(name: string, search: () => void, ...fields: HTMLElement[]): HTMLFormElement {
+  const sent = (event: Event): void => {
+    event.preventDefault();
+    search();
+  };
+  return el("form", { class: "search", role: "search", "aria-label": name, onchange: search, onsubmit: sent }, ...fields);
+}
+
 /** A set of checkboxes. */
 export class Boxes {
   readonly element = el("div", { class: "boxes" });

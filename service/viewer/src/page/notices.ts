@@ -30,6 +30,13 @@ export function asProblem(error: unknown): Problem {
   return new Problem(0, "The page failed", error instanceof Error ? error.message : String(error), "Reload the page.");
 }
 
+/** Show what was thrown, and pass it on; `again` tries once more what failed. */
+export function report(place: HTMLElement, error: unknown, onProblem: (problem: Problem) => void, again?: () => void): void {
+  const problem = asProblem(error);
+  place.replaceChildren(problemNotice(problem, again));
+  onProblem(problem);
+}
+
 /** Announces a text to screen readers. */
 export function announce(message: string): void {
   const status = document.getElementById("status");

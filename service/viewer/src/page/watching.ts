@@ -1,5 +1,5 @@
 import { el } from "./elements";
-import { asProblem, problemNotice } from "./notices";
+import { asProblem, report } from "./notices";
 import type { Hooks } from "./view";
 
 /** A view, or a part of one, that looks at the service again and again until it is left. */
@@ -43,8 +43,8 @@ export abstract class Watching {
       if (signal.aborted) return;
       const problem = asProblem(error);
       // a notice that is drawn anew is read out anew
-      if (isAsked || this.note.childElementCount === 0) this.note.replaceChildren(problemNotice(problem, () => void this.load()));
-      this.hooks.onProblem(problem);
+      if (isAsked || this.note.childElementCount === 0) report(this.note, problem, this.hooks.onProblem, () => void this.load());
+      else this.hooks.onProblem(problem);
       // what is shown stays; it is looked at again until the service is back
       if (problem.status === 0 && !isAsked) this.wait();
     }

@@ -3,10 +3,10 @@ import { getJson, isOver, pathOfJob, Problem } from "../api/requests";
 import type { JobEvent, StatusInfo } from "../api/types";
 import { downloadList } from "../jobs/downloads";
 import { cancellation, jobMenu, retry } from "../jobs/job_actions";
-import { failureRemedy, MODELLED, titleOf } from "../jobs/job_words";
+import { failureRemedy, hasModels, titleOf } from "../jobs/job_words";
 import type { Place } from "../page/address";
-import { el } from "../page/elements";
-import { announce, asProblem, problemNotice, warningNotice } from "../page/notices";
+import { button, el } from "../page/elements";
+import { announce, asProblem, problemNotice, report, warningNotice } from "../page/notices";
 import type { Hooks } from "../page/view";
 import { count, duration } from "../words/numbers";
 import { BuildingsSoFar } from "./so_far";
@@ -26,7 +26,7 @@ export function showJob(place: HTMLElement, named: Place, hooks: Hooks): () => v
     const job = await getJson<StatusInfo>(path, { signal: calledOff.signal });
     if (calledOff.signal.aborted) return;
     document.title = `${titleOf(job)} · gablework`;
-    if (job.status === "successful" && !MODELLED.has(job.processID ?? "reconstruct")) {
+    if (job.status === "successful" && !hasModels(job)) {
       place.replaceChildren(await files(job, path, hooks, calledOff.signal));
     } else if (job.status === "successful") {
       // the 3D library is loaded only if there is something to draw
@@ -49,14 +49,14 @@ export function showJob(place: HTMLElement, named: Place, hooks: Hooks): () => v
   const begin = (): void => {
     look().catch((error: unknown) => {
       if (calledOff.signal.aborted) return;
-      const problem = asProblem(error);
-      if (problem.kind === "no-such-job") {
+      if (asProblem(error).kind === "no-such-job") {
         document.title = "No such job · gablework";
         place.replaceChildren(gone());
         return;
       }
-      place.replaceChildren(el("div", { class: "card" }, problemNotice(problem, begin)));
-      hooks.onProblem(problem);
+      const card = el("div", { class: "card" });
+      place.replaceChildren(card);
+      report(card, error, hooks.onProblem, begin);
     });
   };
   begin();
@@ -80,20 +80,16 @@ function ended(job: StatusInfo, hooks: Hooks): HTMLElement {
       ? problemNotice(new Problem(0, failure?.title ?? "The job failed", failure?.detail ?? job.message ?? "", failureRemedy(job)))
       : el("p", {}, "This job was cancelled; its files are removed. Its tiles can be used again as long as the service keeps them.");
   const note = el("div");
-  const again = el("button", { type: "button", class: "primary" }, "Try again…");
-  again.addEventListener("click", () => {
+  const again = (): void => {
     note.replaceChildren();
-    retry(job, hooks).catch((error: unknown) => {
-      const problem = asProblem(error);
-      note.replaceChildren(problemNotice(problem));
-      hooks.onProblem(problem);
-    });
-  });
-  return el("div", { class: "card" }, heading(job, hooks), notice, note, el("div", { class: "actions" }, again));
+    retry(job, hooks).catch((error: unknown) => report(note, error, hooks.onProblem));
+  };
+  const actions = el("div", { class: "actions" }, button("Try again…", again, { class: "primary" }));
+  return el("div", { class: "card" }, heading(job, hooks), notice, note, actions);
 }
 
-function heading(job: StatusInfo, hooks: Hooks): HTMLElement {
-  return el("div", { class: "job-head" }, el("h1", {}, titleOf(job)), jobMenu(job, hooks));
+function heading(job: StatusInfo, hooks: Hooks, id?: string): HTMLElement {
+  return el("div", { class: "job-head" }, el("h1", { id }, titleOf(job)), jobMenu(job, hooks));
 }
 
 /** A job that the service does not have: its address is old. */
@@ -117,7 +113,7 @@ class ProgressView {
   private readonly elapsed = el("span", { class: "elapsed" });
   private readonly stages = el("ol", { class: "stages" });
   private readonly shown: string[] = [];
-  private readonly rows = new Map<string, { row: HTMLElement; figure: HTMLElement }>();
+  private rows = new Map<string, { row: HTMLElement; figure: HTMLElement }>();
   private readonly started: number;
 
   constructor(
@@ -127,26 +123,26 @@ class ProgressView {
   ) {
     this.started = Date.parse(job.started ?? job.created ?? new Date().toISOString());
     for (const stage of stagesOf(job)) this.addStage(stage);
-    const button = el("button", { type: "button", class: "quiet" }, "Cancel the job");
-    button.addEventListener("click", () => {
+    const cancel = (): void => {
       // a second request would remove the job that the first has stopped
-      if (button.getAttribute("aria-disabled") === "true") return;
-      button.setAttribute("aria-disabled", "true"); // not `disabled`: it keeps the focus
+      if (stop.getAttribute("aria-disabled") === "true") return;
+      stop.setAttribute("aria-disabled", "true"); // not `disabled`: it keeps the focus
       cancellation(job, hooks)
-        .catch((error: unknown) => this.waiting.replaceChildren(problemNotice(asProblem(error))))
-        .finally(() => button.removeAttribute("aria-disabled"));
-    });
+        .catch((error: unknown) => report(this.waiting, error, hooks.onProblem))
+        .finally(() => stop.removeAttribute("aria-disabled"));
+    };
+    const stop = button("Cancel the job", cancel, { class: "quiet" });
     this.element = el(
       "section",
       { class: "card progress", "aria-labelledby": "progress-title" },
-      el("div", { class: "job-head" }, el("h1", { id: "progress-title" }, titleOf(job)), jobMenu(job, hooks)),
+      heading(job, hooks, "progress-title"),
       el("div", { class: "progress-line" }, this.bar, this.percent),
       el("div", { class: "progress-words" }, this.message, this.elapsed),
       this.waiting,
       this.stages,
       soFar?.element ?? "",
       this.warnings,
-      el("div", { class: "actions" }, button),
+      el("div", { class: "actions" }, stop),
     );
     this.set(job.progress ?? 0, job.message ?? "");
     if (job.stage !== undefined) this.enter(job.stage);
@@ -214,17 +210,9 @@ class ProgressView {
   private addStage({ name, words }: Stage, isFirst = false): void {
     const figure = el("span", { class: "stage-figure" });
     const row = el("li", { class: "stage" }, el("span", { class: "stage-name" }, words), figure);
-    if (isFirst) {
-      // rows are in the order of the stages
-      const others = [...this.rows];
-      this.rows.clear();
-      this.rows.set(name, { row, figure });
-      for (const [known, place] of others) this.rows.set(known, place);
-      this.stages.prepend(row);
-      return;
-    }
-    this.rows.set(name, { row, figure });
-    this.stages.append(row);
+    const one = [name, { row, figure }] as const;
+    this.rows = new Map(isFirst ? [one, ...this.rows] : [...this.rows, one]); // in the order of the stages
+    this.stages.replaceChildren(...[...this.rows.values()].map((known) => known.row));
   }
 
   private tick(): void {

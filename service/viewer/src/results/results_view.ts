@@ -12,21 +12,20 @@ import { RunObjects } from "../models/run_objects";
 import { isFiltered, queryWith, selected, tallies, USUAL, wantedOf, type Wanted } from "../models/selection";
 import { elevationUnitM } from "../models/units";
 import { addressOf, placeOf, queryOf, type Place } from "../page/address";
-import { el } from "../page/elements";
-import { announce, asProblem, problemNotice, warningNotice } from "../page/notices";
+import { button, el } from "../page/elements";
+import { announce, asProblem, report, warningNotice } from "../page/notices";
 import type { Hooks } from "../page/view";
 import { ModelScene } from "../scene/scene";
 import { ViewTools } from "../tools/view_tools";
 import { counted } from "../words/numbers";
 import { CATEGORIES, CATEGORY_NAMES, type Category } from "../words/roof_types";
 import { BuildingList, tallyWords } from "./building_list";
-import { FilterPanel } from "./filter_panel";
+import { changed, FilterPanel } from "./filter_panel";
 import { Legend } from "./legend";
 import { LevelChoice } from "./level_choice";
 import { MapPane } from "./map_pane";
 import { Panel } from "./panel";
-import { showRecord } from "./record";
-import { rejectedRecord } from "./rejected_record";
+import { rejectedRecord, showRecord } from "./record";
 import { nothingFound, resultFacts } from "./result_facts";
 
 /** Show the results of a job: models, list, records and downloads. Returns a function that ends the view. */
@@ -66,10 +65,10 @@ class ResultsView {
   private colouring: Colouring = "type";
   private readonly stage: HTMLElement;
   private readonly map: MapPane;
-  private readonly top = el("button", { type: "button", title: "From above, north up (t)", onclick: () => this.scene?.top() }, "Top");
+  private readonly top = button("Top", () => this.scene?.top(), { title: "From above, north up (t)" });
   private readonly modes = {
-    "3d": el("button", { type: "button", onclick: () => this.change({ ...this.wanted, map: false }) }, "3D"),
-    map: el("button", { type: "button", onclick: () => this.change({ ...this.wanted, map: true }) }, "Map"),
+    "3d": button("3D", () => this.change({ ...this.wanted, map: false })),
+    map: button("Map", () => this.change({ ...this.wanted, map: true })),
   };
   private otherLevel = new AbortController();
   private selected: string | null = null;
@@ -89,10 +88,7 @@ class ResultsView {
     this.list = new BuildingList((id) => this.address(id));
     this.legend = new Legend(
       (category, visible) => {
-        const hidden = new Set(this.wanted.hidden);
-        if (visible) hidden.delete(category);
-        else hidden.add(category);
-        this.change({ ...this.wanted, hidden });
+        this.change({ ...this.wanted, hidden: changed(this.wanted.hidden, [category], !visible) });
       },
       (colouring) => {
         this.colouring = colouring;
@@ -100,13 +96,9 @@ class ResultsView {
         this.map.recolour();
       },
     );
+    const fit = button("Fit", () => this.map.fit() || this.scene?.fit(), { title: "Show all (f)" });
     const mode = el("div", { class: "tool-group", role: "group", "aria-label": "3D or map" }, ...Object.values(this.modes));
-    const view = el(
-      "div",
-      { class: "tool-group", role: "group", "aria-label": "View" },
-      el("button", { type: "button", title: "Show all (f)", onclick: () => this.map.fit() || this.scene?.fit() }, "Fit"),
-      this.top,
-    );
+    const view = el("div", { class: "tool-group", role: "group", "aria-label": "View" }, fit, this.top);
     this.panel = new Panel(this.filters.element, this.list, (id) => {
       location.hash = this.address(id);
     });
@@ -116,12 +108,7 @@ class ResultsView {
       el(
         "div",
         { class: "result" },
-        el(
-          "div",
-          { class: "result-head" },
-          el("div", { class: "result-title" }, el("h1", {}, titleOf(job)), this.facts),
-          this.downloads,
-        ),
+        el("div", { class: "result-head" }, el("div", { class: "result-title" }, el("h1", {}, titleOf(job)), this.facts), this.downloads),
         this.legend.element,
         this.stage,
         this.panel.element,
@@ -166,13 +153,11 @@ class ResultsView {
   /** Say what went wrong; `again` tries it once more. */
   fail(error: unknown, again?: () => void): void {
     if (this.calledOff.signal.aborted) return;
-    const problem = asProblem(error);
     const retry = (): void => {
       this.note.replaceChildren();
       again?.();
     };
-    this.note.replaceChildren(problemNotice(problem, again && retry));
-    this.hooks.onProblem(problem);
+    report(this.note, error, this.hooks.onProblem, again && retry);
   }
 
   leave(): void {
@@ -274,8 +259,7 @@ class ResultsView {
     const figure = FIGURE_NAMES.find((name) => name === wanted.sort) ?? null;
     this.list.set(this.shown, figure, this.objects.listed.length === 0 ? "" : "No object fits these filters.");
     this.filters.set(wanted, { shown: this.shown.length, all, ...counts });
-    this.legend.set(this.objects.counts, this.shown);
-    this.legend.check(wanted.hidden);
+    this.legend.set(this.objects.counts, wanted.hidden, this.shown);
     const only = isFiltered(wanted) ? new Set(this.shown.map(({ id }) => id)) : null;
     this.scene?.showOnly(only);
     this.map.showOnly(only);
@@ -410,7 +394,8 @@ class ResultsView {
     if (id === null) return this.panel.showList(before);
     this.panel.showRecord(id, !fly, before === null, (body) => {
       const object = this.objects.rejected.get(id);
-      if (object === undefined) return showRecord(body, this.jobPath, this.method, id, elevationUnitM(this.objects.report.crs), this.hooks.onProblem);
+      const named = { jobPath: this.jobPath, method: this.method, id, elevationUnitM: elevationUnitM(this.objects.report.crs) };
+      if (object === undefined) return showRecord(body, named, this.hooks.onProblem);
       body.replaceChildren(...rejectedRecord(object));
       return () => undefined;
     });

@@ -3,9 +3,10 @@
 import { getJson, request } from "../api/requests";
 import type { Delivery } from "../api/types";
 import { hashOf } from "../page/address";
-import { el } from "../page/elements";
-import { announce, asProblem, problemNotice } from "../page/notices";
-import { fact, table } from "../page/tables";
+import { button, el } from "../page/elements";
+import { announce, report } from "../page/notices";
+import { backLink, rawText } from "../page/sheet";
+import { chip, facts, table, type Column } from "../page/tables";
 import type { Hooks, View } from "../page/view";
 import { Watching } from "../page/watching";
 import { count, counted } from "../words/numbers";
@@ -20,19 +21,14 @@ export const DELIVERY_WORDS: Record<string, string> = {
   dropped: "dropped",
 };
 
+export const deliveryChip = ({ state }: Delivery): HTMLElement => chip(state, DELIVERY_WORDS[state]);
+
 /** What to do about a message that did not arrive. */
-export function deliveryRemedy(state: string): string {
-  switch (state) {
-    case "failed":
-      return "Mend the receiver, then send the message again.";
-    case "gone":
-      return "The receiver answered that it wants no more messages. If that was a mistake, choose “Send what it missed” for the webhook.";
-    case "dropped":
-      return "It was no longer needed. You can still send it again.";
-    default:
-      return "";
-  }
-}
+export const DELIVERY_REMEDIES: Record<string, string> = {
+  failed: "Mend the receiver, then send the message again.",
+  gone: "The receiver answered that it wants no more messages. If that was a mistake, choose “Send what it missed” for the webhook.",
+  dropped: "It was no longer needed. You can still send it again.",
+};
 
 interface ReceiverState {
   enabled: boolean;
@@ -95,7 +91,7 @@ class DeliveryView extends Watching implements View {
       }
       return found.state === "waiting";
     } catch (error) {
-      if (!signal.aborted && this.shown === "") this.sheet.replaceChildren(backLink(), this.note);
+      if (!signal.aborted && this.shown === "") this.sheet.replaceChildren(back(), this.note);
       throw error;
     }
   }
@@ -105,9 +101,7 @@ class DeliveryView extends Watching implements View {
     try {
       await request(`${this.path}/replay`, { method: "POST" });
     } catch (error) {
-      const problem = asProblem(error);
-      this.refusal.replaceChildren(problemNotice(problem));
-      this.hooks.onProblem(problem);
+      report(this.refusal, error, this.hooks.onProblem);
       return;
     }
     announce("The message is sent again.");
@@ -115,55 +109,53 @@ class DeliveryView extends Watching implements View {
   }
 
   private draw(found: Delivery): void {
-    const again = el("button", { type: "button", class: "primary", hidden: found.state === "waiting" && found.attemptCount === 0 }, "Send again");
-    again.addEventListener("click", () => void this.replay());
+    const { nextAttempt, finished, body } = found;
+    const isFirst = found.state === "waiting" && found.attemptCount === 0;
+    const again = button("Send again", () => void this.replay(), { class: "primary", hidden: isFirst });
     const hadFocus = this.sheet.contains(document.activeElement) && document.activeElement?.tagName === "BUTTON";
-    const remedy = deliveryRemedy(found.state);
+    const remedy = DELIVERY_REMEDIES[found.state];
     this.sheet.replaceChildren(
       el("div", { class: "sheet-head" }, el("h1", {}, `Message: ${found.title}`), again),
-      backLink(),
+      back(),
       this.note,
       this.refusal,
-      el(
-        "dl",
+      facts(
         { class: "facts-list" },
-        ...fact("State", el("span", { class: `chip chip-${found.state}` }, DELIVERY_WORDS[found.state] ?? found.state), found.reason === undefined ? "" : ` ${found.reason}`),
-        ...(remedy === "" ? [] : fact("What to do", remedy)),
-        ...fact("Receiver", found.url),
-        ...fact("Job", el("a", { href: hashOf(["jobs", found.jobID]) }, found.jobID)),
-        ...fact("Event", found.type),
-        ...fact("Happened", time(found.created)),
-        ...(found.nextAttempt === undefined ? [] : fact("Next attempt", time(found.nextAttempt))),
-        ...(found.finished === undefined ? [] : fact("Over since", time(found.finished))),
-        ...fact("Id", el("code", {}, found.deliveryID)),
+        ["State", deliveryChip(found), found.reason === undefined ? "" : ` ${found.reason}`],
+        remedy === undefined ? null : ["What to do", remedy],
+        ["Receiver", found.url],
+        ["Job", el("a", { href: hashOf(["jobs", found.jobID]) }, found.jobID)],
+        ["Event", found.type],
+        ["Happened", time(found.created)],
+        nextAttempt === undefined ? null : ["Next attempt", time(nextAttempt)],
+        finished === undefined ? null : ["Over since", time(finished)],
+        ["Id", el("code", {}, found.deliveryID)],
       ),
       attempts(found),
-      ...(found.body === undefined
-        ? []
-        : [el("section", {}, el("h2", { id: "body-title" }, "Body"), el("pre", { class: "raw", tabindex: 0, role: "region", "aria-labelledby": "body-title" }, bodyText(found.body)))]),
+      ...(body === undefined ? [] : [rawText("body-title", "Body", bodyText(body))]),
     );
     if (hadFocus) again.focus();
   }
 }
 
-function attempts({ attempts: made }: Delivery): HTMLElement {
-  const title = el("h2", {}, "Attempts");
-  if (made === undefined || made.length === 0) return el("section", {}, title, el("p", { class: "hint" }, "None yet. A driver of the service sends it."));
-  const rows = made.map(({ number, at, durationMilliseconds, status, error }) =>
-    el(
-      "tr",
-      {},
-      el("td", {}, number),
-      el("td", {}, time(at)),
-      el("td", { class: "figure" }, durationMilliseconds === undefined ? "under way" : `${count(durationMilliseconds)}\u202fms`),
-      el("td", {}, error ?? (status === undefined ? "–" : `answered ${status}`)),
-    ),
-  );
-  return el("section", {}, title, table("Attempts", ["Nr.", "When", "Took", "Result"], rows));
+type Attempt = NonNullable<Delivery["attempts"]>[number];
+
+const ATTEMPTS: Column<Attempt>[] = [
+  { head: "Nr.", cell: ({ number }) => number },
+  { head: "When", cell: ({ at }) => time(at) },
+  {
+    head: "Took",
+    kind: "figure",
+    cell: ({ durationMilliseconds: ms }) => (ms === undefined ? "under way" : `${count(ms)}\u202fms`),
+  },
+  { head: "Result", cell: ({ error, status }) => error ?? (status === undefined ? "–" : `answered ${status}`) },
+];
+
+function attempts({ attempts: made = [] }: Delivery): HTMLElement {
+  const none = el("p", { class: "hint" }, "None yet. A driver of the service sends it.");
+  return el("section", {}, el("h2", {}, "Attempts"), made.length === 0 ? none : table("Attempts", ATTEMPTS, made));
 }
 
-function backLink(): HTMLElement {
-  return el("p", {}, el("a", { href: "#/webhooks" }, "← All messages"));
-}
+const back = (): HTMLElement => backLink("#/webhooks", "All messages");
 
 const time = (text: string): string => new Date(text).toLocaleString();

@@ -39,8 +39,9 @@ export function duration(seconds: number): string {
 }
 
 /** `just now`, `5 min ago`, `3 h ago`, else the date. */
-export function ago(then: Date, now: Date): string {
-  const seconds = (now.getTime() - then.getTime()) / 1000;
+export function ago(time: string): string {
+  const then = new Date(time);
+  const seconds = (Date.now() - then.getTime()) / 1000;
   if (seconds < 60) return "just now";
   if (seconds < 3600) return `${Math.floor(seconds / 60)}${NARROW}min ago`;
   if (seconds < 86_400) return `${Math.floor(seconds / 3600)}${NARROW}h ago`;
