@@ -8,7 +8,6 @@ import { byId, el } from "./page/elements";
 import { field } from "./page/form_fields";
 import { problemNotice } from "./page/notices";
 import type { View } from "./page/view";
-import { welcome } from "./page/welcome";
 import { showJob } from "./progress/job_view";
 import { Submission } from "./submit/submission";
 import { hasView, showView } from "./views";
@@ -56,7 +55,7 @@ function route(): void {
     leave = view.leave;
   } else {
     document.title = "gablework";
-    main.replaceChildren(welcome());
+    main.replaceChildren(byId<HTMLTemplateElement>("welcome").content.cloneNode(true));
     leave = () => undefined;
   }
 }

@@ -2,7 +2,7 @@ import { expect, test } from "vitest";
 import { Batcher, SURFACE, type Batch } from "../src/models/batching";
 import { SequenceReader, type Building } from "../src/models/cityjson";
 import { classesOf, coloursOf, CYCLE, outlineColour, type Colouring } from "../src/models/colouring";
-import { bytesOf, CATEGORIES } from "../src/words/roof_types";
+import { CATEGORIES } from "../src/words/roof_types";
 import { GABLE, METADATA } from "./gable";
 
 /** The house with other attributes. */
@@ -27,8 +27,8 @@ function batched(): { batches: Batch[]; listed: ReturnType<Batcher["add"]>[] } {
 
 /** sRGB bytes to the bytes of linear light that the models have. */
 function linear(colour: string): number[] {
-  return bytesOf(colour).map((byte) => {
-    const share = byte / 255;
+  return [1, 3, 5].map((at) => {
+    const share = Number.parseInt(colour.slice(at, at + 2), 16) / 255;
     return Math.round(255 * (share <= 0.04045 ? share / 12.92 : ((share + 0.055) / 1.055) ** 2.4));
   });
 }

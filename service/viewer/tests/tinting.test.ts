@@ -1,6 +1,6 @@
 import { expect, test } from "vitest";
 import { SURFACE, type Batch } from "../src/models/batching";
-import { tintRoofs } from "../src/models/tinting";
+import { tintRoofs } from "../src/models/colouring";
 
 test("only the roofs of the buildings with a colour change", () => {
   const surfaces = Int16Array.from([7, SURFACE.wall, SURFACE.ground, SURFACE.roof, 0]); // the roof of b is the last

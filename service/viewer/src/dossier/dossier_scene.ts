@@ -1,6 +1,7 @@
 /** A small 3D view of one building with its points; it turns with the pointer and the arrow keys. */
 
 import {
+  Box3,
   BufferAttribute,
   BufferGeometry,
   Color,
@@ -15,29 +16,27 @@ import {
   Points as PointCloud,
   PointsMaterial,
   Scene,
-  SRGBColorSpace,
   Vector3,
   WebGLRenderer,
 } from "three";
-import { buildingMesh, type SceneFrame } from "../models/building_mesh";
+import { OrbitControls } from "three/addons/controls/OrbitControls.js";
+import { buildingMesh, type BuildingMesh, type SceneFrame } from "../models/building_mesh";
 import type { Building } from "../models/cityjson";
 import { pointColour, type Colouring } from "./dossier_drawings";
 import type { Points } from "./dossier_geometry";
 
 const FOV_DEG = 30;
+const START = new Vector3(-0.35, -0.78, 0.52); // from the south-south-west, a third from above
+const [HIGHEST_RAD, LOWEST_RAD] = [0.02, Math.PI / 2 + 0.2]; // from straight above
 const SURFACES = { roof: "#cfd6dd", wall: "#e9e5dd", ground: "#b9b3a8" } as const;
 
 export class DossierScene {
   private readonly renderer: WebGLRenderer;
   private readonly scene = new Scene();
   private readonly camera = new PerspectiveCamera(FOV_DEG, 1, 0.1, 5000);
-  private readonly middle = new Vector3();
+  private readonly controls: OrbitControls;
   private readonly cloud: PointCloud | null = null;
-  private readonly calledOff = new AbortController();
   private readonly watch: ResizeObserver;
-  private distance = 10;
-  private azimuth = -2.0;
-  private elevation = 0.55;
   private frame = 0;
 
   /** @throws Error if the browser has no WebGL. */
@@ -51,43 +50,43 @@ export class DossierScene {
     // kept after drawing, so that it can be printed
     this.renderer = new WebGLRenderer({ canvas, antialias: true, alpha: true, preserveDrawingBuffer: true });
     this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
-    this.camera.up.set(0, 0, 1);
     const sun = new DirectionalLight("#fff6e8", 1.9);
     sun.position.set(-0.4, -0.8, 1.2);
     this.scene.add(new HemisphereLight("#f4f8ff", "#a89f92", 2), sun);
-    this.addModel(building, frame);
+    const mesh = buildingMesh(building, frame);
+    if (mesh.positions.length > 0) this.addModel(mesh);
+    const bounds = new Box3().setFromArray(mesh.positions);
     if (points !== null && points.xyz.length > 0) {
       const geometry = new BufferGeometry();
       geometry.setAttribute("position", new BufferAttribute(Float32Array.from(points.xyz), 3));
       this.cloud = new PointCloud(geometry, new PointsMaterial({ size: points.residuals.length > 3000 ? 1.7 : 2.5, sizeAttenuation: false, vertexColors: true }));
       this.scene.add(this.cloud);
+      bounds.union(new Box3().setFromArray(points.xyz));
     }
-    this.colour(colouring);
-    this.place(building, frame);
-    const { signal } = this.calledOff;
-    canvas.addEventListener("pointerdown", (event) => canvas.setPointerCapture(event.pointerId), { signal });
-    canvas.addEventListener("pointermove", (event) => this.dragged(event), { signal });
-    canvas.addEventListener("wheel", (event) => this.wheeled(event), { signal, passive: false });
-    canvas.addEventListener("keydown", (event) => this.typed(event), { signal });
+    this.camera.up.set(0, 0, 1);
+    this.controls = new OrbitControls(this.camera, canvas);
+    Object.assign(this.controls, { enablePan: false, minDistance: 1, maxDistance: 2000, minPolarAngle: HIGHEST_RAD, maxPolarAngle: LOWEST_RAD });
+    bounds.getCenter(this.controls.target);
+    const distance = Math.max(2, bounds.getSize(new Vector3()).length() / 2.3 / Math.sin((FOV_DEG * Math.PI) / 360));
+    this.camera.position.copy(this.controls.target).addScaledVector(START, distance);
+    this.controls.addEventListener("change", () => this.request());
+    canvas.addEventListener("keydown", (event) => this.typed(event));
     this.watch = new ResizeObserver(() => this.resize());
     this.watch.observe(canvas);
+    this.colour(colouring);
     this.resize();
   }
 
   colour(colouring: Colouring): void {
-    if (this.cloud === null || this.points === null) return;
-    const n = this.points.residuals.length;
-    const colours = new Float32Array(3 * n);
-    const colour = new Color();
-    for (let i = 0; i < n; i++) {
-      colour.setStyle(pointColour(this.points, i, colouring), SRGBColorSpace).toArray(colours, 3 * i);
-    }
-    this.cloud.geometry.setAttribute("color", new BufferAttribute(colours, 3));
+    const { points } = this;
+    if (this.cloud === null || points === null) return;
+    const colours = points.residuals.length;
+    this.cloud.geometry.setAttribute("color", coloursOf(Array.from({ length: colours }, (_, i) => pointColour(points, i, colouring))));
     this.request();
   }
 
   dispose(): void {
-    this.calledOff.abort();
+    this.controls.dispose();
     this.watch.disconnect();
     cancelAnimationFrame(this.frame);
     this.scene.traverse((object) => {
@@ -99,69 +98,31 @@ export class DossierScene {
     this.renderer.forceContextLoss();
   }
 
-  private addModel(building: Building, frame: SceneFrame): void {
-    const mesh = buildingMesh(building, frame);
-    if (mesh.positions.length === 0) return;
+  private addModel({ positions, normals, kinds, edges }: BuildingMesh): void {
     const geometry = new BufferGeometry();
-    geometry.setAttribute("position", new BufferAttribute(Float32Array.from(mesh.positions), 3));
-    geometry.setAttribute("normal", new BufferAttribute(Int8Array.from(mesh.normals), 3, true));
-    const colour = new Color();
-    const colours = new Float32Array(mesh.positions.length);
-    mesh.kinds.forEach((kind, i) => colour.setStyle(SURFACES[kind], SRGBColorSpace).toArray(colours, 3 * i));
-    geometry.setAttribute("color", new BufferAttribute(colours, 3));
+    geometry.setAttribute("position", new BufferAttribute(Float32Array.from(positions), 3));
+    geometry.setAttribute("normal", new BufferAttribute(Int8Array.from(normals), 3, true));
+    geometry.setAttribute("color", coloursOf(kinds.map((kind) => SURFACES[kind])));
     const surface = new MeshLambertMaterial({ vertexColors: true, side: DoubleSide, polygonOffset: true, polygonOffsetFactor: 2, polygonOffsetUnits: 2 });
     const lines = new BufferGeometry();
-    lines.setAttribute("position", new BufferAttribute(Float32Array.from(mesh.edges), 3));
+    lines.setAttribute("position", new BufferAttribute(Float32Array.from(edges), 3));
     this.scene.add(new Mesh(geometry, surface), new LineSegments(lines, new LineBasicMaterial({ color: "#39424b" })));
   }
 
-  /** Look at all of the model and its points. */
-  private place(building: Building, frame: SceneFrame): void {
-    const { positions } = buildingMesh(building, frame);
-    const low = new Vector3(Infinity, Infinity, Infinity);
-    const high = new Vector3(-Infinity, -Infinity, -Infinity);
-    const corner = new Vector3();
-    for (const coordinates of [positions, this.points?.xyz ?? []]) {
-      for (let i = 0; i < coordinates.length; i += 3) {
-        corner.set(coordinates[i], coordinates[i + 1], coordinates[i + 2]);
-        low.min(corner);
-        high.max(corner);
-      }
-    }
-    if (low.x > high.x) return;
-    this.middle.addVectors(low, high).multiplyScalar(0.5);
-    this.distance = Math.max(2, low.distanceTo(high) / 2.3 / Math.sin((FOV_DEG * Math.PI) / 360));
-  }
-
-  private dragged(event: PointerEvent): void {
-    if (event.buttons === 0) return;
-    this.turn(-event.movementX * 0.008, event.movementY * 0.008);
-  }
-
-  private wheeled(event: WheelEvent): void {
-    event.preventDefault();
-    this.zoom(Math.exp(event.deltaY * 0.001));
-  }
-
   private typed(event: KeyboardEvent): void {
-    const turns: Record<string, [number, number]> = { ArrowLeft: [-0.15, 0], ArrowRight: [0.15, 0], ArrowUp: [0, 0.12], ArrowDown: [0, -0.12] };
-    const turn = turns[event.key];
-    if (turn !== undefined) this.turn(...turn);
-    else if (event.key === "+") this.zoom(0.85);
-    else if (event.key === "-") this.zoom(1 / 0.85);
-    else return;
+    const { controls } = this;
+    const keys: Record<string, () => void> = {
+      ArrowLeft: () => controls.rotateLeft(0.15),
+      ArrowRight: () => controls.rotateLeft(-0.15),
+      ArrowUp: () => controls.rotateUp(0.12),
+      ArrowDown: () => controls.rotateUp(-0.12),
+      "+": () => controls.dollyIn(0.85),
+      "-": () => controls.dollyOut(0.85),
+    };
+    const action = keys[event.key];
+    if (action === undefined) return;
     event.preventDefault();
-  }
-
-  private turn(azimuth: number, elevation: number): void {
-    this.azimuth += azimuth;
-    this.elevation = Math.min(1.55, Math.max(-0.2, this.elevation + elevation));
-    this.request();
-  }
-
-  private zoom(factor: number): void {
-    this.distance = Math.min(2000, Math.max(1, this.distance * factor));
-    this.request();
+    action();
   }
 
   private resize(): void {
@@ -169,7 +130,7 @@ export class DossierScene {
     if (width === 0 || height === 0) return;
     this.renderer.setSize(width, height, false);
     this.camera.aspect = width / height;
-    this.camera.updateProjectionMatrix();
+    this.controls.update();
     this.draw();
   }
 
@@ -179,15 +140,18 @@ export class DossierScene {
   }
 
   private draw(): void {
-    const flat = Math.cos(this.elevation) * this.distance;
-    this.camera.position
-      .set(Math.cos(this.azimuth) * flat, Math.sin(this.azimuth) * flat, Math.sin(this.elevation) * this.distance)
-      .add(this.middle);
-    this.camera.far = this.distance * 4 + 500;
-    this.camera.near = this.distance / 100;
+    const distance = this.controls.getDistance();
+    Object.assign(this.camera, { near: distance / 100, far: 4 * distance + 500 });
     this.camera.updateProjectionMatrix();
-    this.camera.lookAt(this.middle);
     this.renderer.render(this.scene, this.camera);
     this.canvas.dataset["drawn"] = "true";
   }
+}
+
+/** The colours of corners or points for the graphics card. */
+function coloursOf(colours: readonly string[]): BufferAttribute {
+  const values = new Float32Array(3 * colours.length);
+  const colour = new Color();
+  colours.forEach((one, i) => colour.set(one).toArray(values, 3 * i));
+  return new BufferAttribute(values, 3);
 }

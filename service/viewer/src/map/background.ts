@@ -2,9 +2,11 @@
 
 import { getJson, ofRun } from "../api/requests";
 import type { Feature } from "../api/types";
+import type { RunObjects } from "../models/run_objects";
+import { measure } from "../words/numbers";
 import { georeference, pairsOf, type Georeference, type Xy } from "./georeference";
 import type { MapView } from "./map_view";
-import type { Backdrop } from "./outline_map";
+import type { Backdrop, OutlineMap } from "./outline_map";
 
 const TILE_PX = 256;
 const SAMPLE = 60; // buildings whose outlines show where the plane lies on Earth; ids are random, so they lie anywhere
@@ -14,18 +16,24 @@ const ANCESTORS = 5; // levels that stand in for tiles that have not arrived
 const OVERLAP = 1 / TILE_PX; // of a tile, against seams
 
 /** What the operator set. */
-export interface TileSource {
+interface TileSource {
   /** https, with {z}, {x} and {y}. */
   template: string;
   credit: string;
   maxZoom: number;
 }
 
-/** The tiles that the page names; null if it names none. */
-export function tileSource(): TileSource | null {
+/** Lay the operator's tiles beneath the map of a run, if the results lie on Earth. */
+export async function layBackground(map: OutlineMap, { jobPath, method, report: { crs }, frame }: RunObjects, signal: AbortSignal): Promise<void> {
   const given = (name: string): string => document.querySelector<HTMLMetaElement>(`meta[name="${name}"]`)?.content ?? "";
-  const template = given("map-tiles");
-  return template === "" ? null : { template, credit: given("map-credit"), maxZoom: Number(given("map-max-zoom")) };
+  const source: TileSource = { template: given("map-tiles"), credit: given("map-credit"), maxZoom: Number(given("map-max-zoom")) };
+  if (source.template === "" || (crs?.to_wgs84 ?? null) === null) return;
+  const { origin: [east, north], horizontalUnitM: unit } = frame;
+  const inPlane = ([x, y]: Xy): Xy => [(x - east) * unit, (y - north) * unit];
+  const place = await locate(jobPath, method, inPlane, signal);
+  if (place === null) return;
+  const within = place.errorM < 0.5 ? "" : ` · placed to within ${measure(place.errorM, 1, "m")}`;
+  map.lay(new Background(source, place, map.request), `${source.credit}${within}`);
 }
 
 /**
@@ -34,7 +42,7 @@ export function tileSource(): TileSource | null {
  * @param inPlane From the coordinates of the tiles to the plane of the map.
  * @returns Null if the results have too few outlines.
  */
-export async function locate(
+async function locate(
   jobPath: string,
   method: string | null,
   inPlane: (place: Xy) => Xy,
@@ -48,7 +56,7 @@ export async function locate(
   return georeference(pairsOf(native, degrees, inPlane));
 }
 
-export class Background implements Backdrop {
+class Background implements Backdrop {
   private readonly tiles = new Map<string, HTMLImageElement>();
 
   /** @param onArrival A tile has arrived: draw again. */

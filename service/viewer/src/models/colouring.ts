@@ -1,7 +1,8 @@
 /** What the colour of a roof shows: the choices of the view, their classes and their colours. */
 
+import { Color } from "three";
 import { reasonWords } from "../words/reasons";
-import { bytesOf, CATEGORIES, type Category } from "../words/roof_types";
+import { CATEGORIES, type Category } from "../words/roof_types";
 import { SURFACE, type Batch, type Listed } from "./batching";
 
 /** A colour with its meaning. */
@@ -133,12 +134,27 @@ export function coloursOf(batch: Batch, colouring: Colouring): Uint8Array {
   return colours;
 }
 
-/** IEC 61966-2-1: sRGB to linear light, both as bytes. */
-export function linear(colour: string): number[] {
-  return bytesOf(colour).map((byte) => {
-    const value = byte / 255;
-    return Math.round(255 * (value <= 0.04045 ? value / 12.92 : ((value + 0.055) / 1.055) ** 2.4));
-  });
+/** Linear light of a colour, as bytes. */
+function linear(colour: string): number[] {
+  return new Color(colour).toArray().map((value) => Math.round(255 * value));
 }
 
 const [WALL, FLOOR] = [linear("#ece7de"), linear("#b9b3a8")];
+
+/**
+ * Colour the roofs of single buildings.
+ *
+ * @param colours Red, green, blue and a fourth byte per corner, in linear light; changed in place.
+ * @param colourOf The colour of a building as `#rrggbb`; null keeps its own.
+ */
+export function tintRoofs(batch: Batch, colours: Uint8Array, colourOf: (id: string) => string | null): void {
+  batch.ids.forEach((id, index) => {
+    const colour = colourOf(id);
+    if (colour === null) return;
+    const bytes = linear(colour);
+    for (let corner = batch.starts[index]; corner < batch.starts[index + 1]; corner++) {
+      const surface = batch.surfaces[corner];
+      if (surface !== SURFACE.wall && surface !== SURFACE.ground) colours.set(bytes, 4 * corner);
+    }
+  });
+}

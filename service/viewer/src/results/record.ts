@@ -112,8 +112,8 @@ function takeAway(meshPath: unknown, { jobPath, method, id }: Named): HTMLElemen
   return el(
     "div",
     { class: "record-links" },
-    kind === null ? null : downloadLink(kind.toUpperCase(), ofRun(`${path}?f=${kind}`, method), `${id}.${kind}`),
-    downloadLink("CityJSON", ofRun(`${path}?f=cityjson`, method), `${id}.city.json`),
+    kind === null ? null : downloadLink(kind.toUpperCase(), ofRun(`${path}?f=${kind}`, method)),
+    downloadLink("CityJSON", ofRun(`${path}?f=cityjson`, method)),
   );
 }
 

@@ -3,6 +3,7 @@ import type { Feature, StatusInfo } from "../api/types";
 import { downloadMenu, pageLink } from "../jobs/downloads";
 import { jobMenu } from "../jobs/job_actions";
 import { titleOf } from "../jobs/job_words";
+import { OutlineMap } from "../map/outline_map";
 import type { Batch, Listed } from "../models/batching";
 import { outlineColour, type Colouring } from "../models/colouring";
 import { flatOutlines } from "../models/failed_footprints";
@@ -23,7 +24,6 @@ import { BuildingList, tallyWords } from "./building_list";
 import { changed, FilterPanel } from "./filter_panel";
 import { Legend } from "./legend";
 import { LevelChoice } from "./level_choice";
-import { MapPane } from "./map_pane";
 import { Panel } from "./panel";
 import { rejectedRecord, showRecord } from "./record";
 import { nothingFound, resultFacts } from "./result_facts";
@@ -64,7 +64,8 @@ class ResultsView {
   private scene: ModelScene | null = null;
   private colouring: Colouring = "type";
   private readonly stage: HTMLElement;
-  private readonly map: MapPane;
+  private readonly map = new OutlineMap((id) => this.open(id));
+  private background: Promise<void> | null = null;
   private readonly top = button("Top", () => this.scene?.top(), { title: "From above, north up (t)" });
   private readonly modes = {
     "3d": button("3D", () => this.change({ ...this.wanted, map: false })),
@@ -93,17 +94,17 @@ class ResultsView {
       (colouring) => {
         this.colouring = colouring;
         this.scene?.colourBy(colouring);
-        this.map.recolour();
+        this.colourMap();
       },
     );
-    const fit = button("Fit", () => this.map.fit() || this.scene?.fit(), { title: "Show all (f)" });
+    const fit = button("Fit", () => (this.wanted.map ? this.map : this.scene)?.fit(), { title: "Show all (f)" });
     const mode = el("div", { class: "tool-group", role: "group", "aria-label": "3D or map" }, ...Object.values(this.modes));
     const view = el("div", { class: "tool-group", role: "group", "aria-label": "View" }, fit, this.top);
     this.panel = new Panel(this.filters.element, this.list, (id) => {
       location.hash = this.address(id);
     });
     this.stage = el("div", { class: "stage3d" }, this.canvas, this.viewTools.cards, this.viewTools.bar(this.levels.element, mode, view), this.note);
-    this.map = new MapPane(this.stage, (id) => this.open(id), (shape) => this.colourOf(shape));
+    this.colourMap();
     place.replaceChildren(
       el(
         "div",
@@ -166,7 +167,7 @@ class ResultsView {
     this.panel.leave();
     this.viewTools.leave();
     this.scene?.dispose();
-    this.map.close();
+    this.map.dispose();
   }
 
   // --- loading
@@ -292,14 +293,26 @@ class ResultsView {
     this.canvas.hidden = wanted;
     this.levels.element.classList.toggle("levels-away", wanted);
     this.viewTools.setAway(wanted);
-    if (!wanted) return this.map.close();
-    await this.map.open(this.objects, this.calledOff.signal);
+    const { element } = this.map;
+    if (!wanted) element.remove();
+    if (!wanted || element.isConnected) return;
+    this.stage.prepend(element);
+    this.map.select(this.selected, this.selected !== null);
+    await (this.background ??= this.layBackground());
   }
 
-  /** The colour of an object on the map, also of one that is still to come. */
-  private colourOf({ id, category }: { id: string; category: Category }): string {
-    const object = this.objects.find(id);
-    return object === undefined ? CATEGORIES[category].colour : outlineColour(this.colouring, object);
+  private async layBackground(): Promise<void> {
+    if (document.querySelector('meta[name="map-tiles"]') === null) return;
+    const { layBackground } = await import("../map/background");
+    await layBackground(this.map, this.objects, this.calledOff.signal);
+  }
+
+  /** Colour the map as the models are, also objects that are still to come. */
+  private colourMap(): void {
+    this.map.colourBy(({ id, category }) => {
+      const object = this.objects.find(id);
+      return object === undefined ? CATEGORIES[category].colour : outlineColour(this.colouring, object);
+    });
   }
 
   // --- the methods of a comparison

@@ -9,18 +9,16 @@ import {
   LineSegments,
   Mesh,
   MeshLambertMaterial,
-  Vector3,
   type Ray,
 } from "three";
 import { LineMaterial } from "three/addons/lines/LineMaterial.js";
 import { LineSegments2 } from "three/addons/lines/LineSegments2.js";
 import { LineSegmentsGeometry } from "three/addons/lines/LineSegmentsGeometry.js";
 import type { Batch } from "../models/batching";
-import { coloursOf, type Colouring } from "../models/colouring";
-import { tintRoofs } from "../models/tinting";
+import { coloursOf, tintRoofs, type Colouring } from "../models/colouring";
 import { isFlat, isHatched } from "../words/roof_types";
 import { hatched } from "./hatching";
-import { pick, type Hit } from "./picking";
+import { boxOf, pick, type Hit } from "./picking";
 
 interface Drawn {
   batch: Batch;
@@ -95,7 +93,7 @@ export class DrawnModels {
   /** The boxes of the shown models; of all models if none is shown. */
   boxes(): Box3[] {
     const shown = this.all((batch, index) => (batch.shown?.[index] === 0 ? null : boxOf(batch, index))).filter((box) => box !== null);
-    return shown.length > 0 ? shown : this.all(boxOf);
+    return shown.length > 0 ? shown : this.all((batch, index) => boxOf(batch, index));
   }
 
   /** The batches of the shown models. */
@@ -105,7 +103,7 @@ export class DrawnModels {
 
   /** The first of the shown models that a ray meets, at its outer side only if `fromOutside`. */
   first(ray: Ray, fromOutside = false): Hit<Batch> | null {
-    return pick(this.shown(), ray.origin.toArray(), ray.direction.toArray(), fromOutside);
+    return pick(this.shown(), ray, fromOutside);
   }
 
   /** Show these objects and hide all others; null shows all. */
@@ -208,9 +206,4 @@ function drawOnly(geometry: BufferGeometry, starts: Uint32Array, shown: Uint8Arr
   index.needsUpdate = true;
   geometry.setIndex(index);
   geometry.setDrawRange(0, n);
-}
-
-function boxOf(batch: Batch, index: number): Box3 {
-  const [x0, y0, z0, x1, y1, z1] = batch.boxes.subarray(6 * index, 6 * index + 6);
-  return new Box3(new Vector3(x0, y0, z0), new Vector3(x1, y1, z1));
 }

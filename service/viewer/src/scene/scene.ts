@@ -226,7 +226,7 @@ export class ModelScene {
     const { camera, models } = this;
     camera.update(now);
     this.pointing.update();
-    camera.setPlanes(boxDistance(models.shown(), camera.view.position.toArray()));
+    camera.setPlanes(boxDistance(models.shown(), camera.view.position));
     models.fade(this.canvas.clientHeight / (2 * camera.distance * TAN_HALF_FOV));
     const heightPx = this.renderer.getDrawingBufferSize(new Vector2()).y;
     for (const layer of this.layers) layer.update(camera.view, heightPx);
