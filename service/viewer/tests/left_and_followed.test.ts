@@ -5,7 +5,7 @@ import { afterEach, beforeEach, describe, expect, test, vi } from "vitest";
 import type { StatusInfo } from "../src/api/types";
 import { showChanges } from "../src/changes/changes_view";
 import type { Listed } from "../src/models/batching";
-import type { FromLoading } from "../src/models/loading_messages";
+import type { FromLoading } from "../src/models/model_loading";
 import { hashOf, partsOf } from "../src/page/address";
 import { showResults } from "../src/results/results_view";
 import type { Ground } from "../src/scene/ground";

@@ -6,7 +6,7 @@ import type { SceneFrame } from "../models/building_mesh";
 import { SequenceReader, type Building } from "../models/cityjson";
 import { CYCLE } from "../models/colouring";
 import { COLUMNS, shown } from "../models/columns";
-import { ringsOf } from "../models/rings";
+import { ringsOf } from "../models/plan";
 import { elevationUnitM, inMetres, modelUnits } from "../models/units";
 import { el, svg } from "../page/elements";
 import { asProblem, problemNotice } from "../page/notices";
@@ -129,7 +129,7 @@ function draw(body: HTMLElement, loaded: Loaded): () => void {
   let over = false;
   const paint = (colouring: Colouring): void => {
     plan.replaceChildren(planDrawing(outline, edges, section, points, colouring));
-    if (section !== null) profile.replaceChildren(sectionDrawing(model, section, 0, points, halfWidthM, colouring));
+    if (section !== null) profile.replaceChildren(sectionDrawing(model, section, points, halfWidthM, colouring));
     key.replaceChildren(...(points === null ? [] : colourKey(points, colouring)));
     scene?.colour(colouring);
   };

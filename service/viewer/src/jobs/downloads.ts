@@ -1,3 +1,4 @@
+import { waited } from "../api/event_stream";
 import { currentKey, getJson, ofRun, request, serviceUrl } from "../api/requests";
 import type { Link } from "../api/types";
 import { dropDown } from "../page/action_menu";
@@ -93,7 +94,7 @@ async function selected(path: string, method: string | null, signal: AbortSignal
       return await getJson<Offered>(ofRun(path, method), { signal });
     } catch (error) {
       if (asProblem(error).kind !== "selection-busy") throw error;
-      await new Promise((resolve) => setTimeout(resolve, ASK_AGAIN_MS));
+      await waited(ASK_AGAIN_MS, signal);
     }
   }
 }

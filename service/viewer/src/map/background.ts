@@ -2,9 +2,10 @@
 
 import { getJson, ofRun } from "../api/requests";
 import type { Feature } from "../api/types";
+import type { Point } from "../models/plan";
 import type { RunObjects } from "../models/run_objects";
 import { measure } from "../words/numbers";
-import { georeference, pairsOf, type Georeference, type Xy } from "./georeference";
+import { georeference, pairsOf, type Georeference } from "./georeference";
 import type { MapView } from "./map_view";
 import type { Backdrop, OutlineMap } from "./outline_map";
 
@@ -29,7 +30,7 @@ export async function layBackground(map: OutlineMap, { jobPath, method, report: 
   const source: TileSource = { template: given("map-tiles"), credit: given("map-credit"), maxZoom: Number(given("map-max-zoom")) };
   if (source.template === "" || (crs?.to_wgs84 ?? null) === null) return;
   const { origin: [east, north], horizontalUnitM: unit } = frame;
-  const inPlane = ([x, y]: Xy): Xy => [(x - east) * unit, (y - north) * unit];
+  const inPlane = ([x, y]: Point): Point => [(x - east) * unit, (y - north) * unit];
   const place = await locate(jobPath, method, inPlane, signal);
   if (place === null) return;
   const within = place.errorM < 0.5 ? "" : ` · placed to within ${measure(place.errorM, 1, "m")}`;
@@ -45,7 +46,7 @@ export async function layBackground(map: OutlineMap, { jobPath, method, report: 
 async function locate(
   jobPath: string,
   method: string | null,
-  inPlane: (place: Xy) => Xy,
+  inPlane: (place: Point) => Point,
   signal: AbortSignal,
 ): Promise<Georeference | null> {
   const page = async (crs: string): Promise<Feature[]> => {
@@ -69,7 +70,7 @@ class Background implements Backdrop {
   draw(context: CanvasRenderingContext2D, view: MapView): void {
     const { toMercator } = this.place;
     const [west, south, east, north] = view.box();
-    const corners = ([[west, south], [east, south], [east, north], [west, north]] as Xy[]).map(toMercator);
+    const corners = ([[west, south], [east, south], [east, north], [west, north]] as Point[]).map(toMercator);
     const [middle, beside] = [toMercator([view.east, view.north]), toMercator([view.east + 1 / view.scale, view.north])];
     const perPixel = Math.hypot(beside[0] - middle[0], beside[1] - middle[1]);
     const sharp = Math.log2(Math.min(devicePixelRatio, 2));
@@ -91,7 +92,7 @@ class Background implements Backdrop {
       const image = this.tiles.get(`${level - up}/${x >> up}/${y >> up}`);
       if (image === undefined || !image.complete || image.naturalWidth === 0) continue;
       const side = 2 ** level;
-      const corner = (dx: number, dy: number): Xy => {
+      const corner = (dx: number, dy: number): Point => {
         const [east, north] = this.place.toPlane([(x + dx) / side, (y + dy) / side]);
         return view.pixel(east, north);
       };

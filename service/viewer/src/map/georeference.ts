@@ -1,18 +1,17 @@
 /** From the plane of the map to Web Mercator and back, fitted to places that are known in both. */
 
 import type { Feature } from "../api/types";
-
-export type Xy = [number, number];
+import { areaOf, boxAround, polygonsOf, type Point } from "../models/plan";
 
 /** A place in metres around the scene's origin, and in Web Mercator: 0 to 1 from west to east and from north to south. */
 export interface Pair {
-  plane: Xy;
-  mercator: Xy;
+  plane: Point;
+  mercator: Point;
 }
 
 export interface Georeference {
-  toMercator: (place: Xy) => Xy;
-  toPlane: (place: Xy) => Xy;
+  toMercator: (place: Point) => Point;
+  toPlane: (place: Point) => Point;
   /** Largest distance in metres between a place and where the fit puts it. */
   errorM: number;
 }
@@ -20,7 +19,7 @@ export interface Georeference {
 const CURVED_M = 400; // below this extent a plane bends by less than 4 cm: three terms are enough
 
 /** Longitude and latitude in degrees as a place in Web Mercator. */
-export function mercatorOf([longitude, latitude]: readonly number[]): Xy {
+export function mercatorOf([longitude, latitude]: readonly number[]): Point {
   const sine = Math.sin((latitude * Math.PI) / 180);
   return [longitude / 360 + 0.5, 0.5 - Math.atanh(sine) / (2 * Math.PI)];
 }
@@ -30,7 +29,7 @@ export function mercatorOf([longitude, latitude]: readonly number[]): Xy {
  *
  * @param inPlane From the coordinates of the tiles to the plane of the map.
  */
-export function pairsOf(native: readonly Feature[], degrees: readonly Feature[], inPlane: (place: Xy) => Xy): Pair[] {
+export function pairsOf(native: readonly Feature[], degrees: readonly Feature[], inPlane: (place: Point) => Point): Pair[] {
   const others = new Map(degrees.map((feature) => [feature.id, feature]));
   return native.flatMap((feature) => {
     const [mine, theirs] = [outerRing(feature), outerRing(others.get(feature.id))];
@@ -42,22 +41,10 @@ export function pairsOf(native: readonly Feature[], degrees: readonly Feature[],
   });
 }
 
-/** The outer ring of an outline of one part, not closed; empty for any other. */
-function outerRing(feature: Feature | undefined): Xy[] {
-  const geometry = feature?.geometry;
-  if (geometry?.type === "Polygon") return (geometry.coordinates as Xy[][])[0].slice(0, -1);
-  if (geometry?.type === "MultiPolygon" && (geometry.coordinates as Xy[][][]).length === 1) {
-    return (geometry.coordinates as Xy[][][])[0][0].slice(0, -1);
-  }
-  return []; // the order of several parts may differ
-}
-
-function areaOf(ring: readonly Xy[]): number {
-  const [x, y] = ring[0];
-  return ring.reduce((sum, [ax, ay], i) => {
-    const [bx, by] = ring[(i + 1) % ring.length];
-    return sum + (ax - x) * (by - y) - (bx - x) * (ay - y);
-  }, 0);
+/** The outer ring of an outline of one part, not closed; empty for any other: the order of several parts may differ. */
+function outerRing(feature: Feature | undefined): readonly Point[] {
+  const [polygon, ...others] = polygonsOf(feature?.geometry);
+  return polygon === undefined || others.length > 0 ? [] : polygon[0].slice(0, -1);
 }
 
 /** Fit both directions; null if there are too few places, or all on one line. */
@@ -74,22 +61,19 @@ export function georeference(pairs: readonly Pair[]): Georeference | null {
   return { toMercator, toPlane, errorM: errors.reduce((a, b) => Math.max(a, b), 0) };
 }
 
-function extentOf(places: readonly Xy[]): number {
-  const spans = [0, 1].map((axis) => {
-    const values = places.map((place) => place[axis]);
-    return values.reduce((a, b) => Math.max(a, b), -Infinity) - values.reduce((a, b) => Math.min(a, b), Infinity);
-  });
-  return Math.max(...spans);
+function extentOf(places: readonly Point[]): number {
+  const [west, south, east, north] = boxAround(places);
+  return Math.max(east - west, north - south);
 }
 
 /** The polynomial of the first or second order that takes places to others with the least squares; null if there is none. */
-function fitted(from: readonly Xy[], to: readonly Xy[], curved: boolean): ((place: Xy) => Xy) | null {
+function fitted(from: readonly Point[], to: readonly Point[], curved: boolean): ((place: Point) => Point) | null {
   if (from.length < 3) return null;
   // around the middle and in a unit of the extent: the squares would lose digits otherwise
-  const middle: Xy = [mean(from, 0), mean(from, 1)];
+  const middle: Point = [mean(from, 0), mean(from, 1)];
   const unit = Math.max(extentOf(from), Number.MIN_VALUE);
-  const target: Xy = [mean(to, 0), mean(to, 1)];
-  const terms = ([x, y]: Xy): number[] => {
+  const target: Point = [mean(to, 0), mean(to, 1)];
+  const terms = ([x, y]: Point): number[] => {
     const [u, v] = [(x - middle[0]) / unit, (y - middle[1]) / unit];
     return curved ? [1, u, v, u * u, u * v, v * v] : [1, u, v];
   };
@@ -111,7 +95,7 @@ function fitted(from: readonly Xy[], to: readonly Xy[], curved: boolean): ((plac
   };
 }
 
-function mean(places: readonly Xy[], axis: 0 | 1): number {
+function mean(places: readonly Point[], axis: 0 | 1): number {
   return places.reduce((sum, place) => sum + place[axis], 0) / places.length;
 }
 

@@ -1,9 +1,10 @@
 /** The outlines in plan, north up, drawn on a canvas. It is independent of the service, of lists and of the 3D view. */
 
 import type { Outlines } from "../models/outlines";
+import { boxAround, united, type Box } from "../models/plan";
 import { el } from "../page/elements";
 import { CATEGORIES, CATEGORY_NAMES, isFlat, type Category } from "../words/roof_types";
-import { MapView, scaleBar, type Box } from "./map_view";
+import { MapView, scaleBar } from "./map_view";
 import "./outline_map.css";
 
 const CELLS = 24; // paths per side of the map: those out of sight are not drawn
@@ -377,20 +378,7 @@ function traced(rings: readonly Float32Array[], path = new Path2D()): Path2D {
 }
 
 function boxOf(rings: readonly Float32Array[]): Box {
-  const box: Box = [Infinity, Infinity, -Infinity, -Infinity];
-  for (const ring of rings) {
-    for (let i = 0; i < ring.length; i += 2) {
-      box[0] = Math.min(box[0], ring[i]);
-      box[1] = Math.min(box[1], ring[i + 1]);
-      box[2] = Math.max(box[2], ring[i]);
-      box[3] = Math.max(box[3], ring[i + 1]);
-    }
-  }
-  return box;
-}
-
-function united(boxes: readonly Box[]): Box {
-  return boxes.reduce(([a, b, c, d], [x0, y0, x1, y1]) => [Math.min(a, x0), Math.min(b, y0), Math.max(c, x1), Math.max(d, y1)]);
+  return boxAround(rings.flatMap((ring) => Array.from({ length: ring.length / 2 }, (_, i) => [ring[2 * i], ring[2 * i + 1]])));
 }
 
 function meet(a: Box, b: Box): boolean {

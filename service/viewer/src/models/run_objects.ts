@@ -5,8 +5,7 @@ import type { Feature, RunReport } from "../api/types";
 import type { Category } from "../words/roof_types";
 import type { Listed } from "./batching";
 import type { SceneFrame } from "./building_mesh";
-import type { FromLoading } from "./loading_messages";
-import { loadModels } from "./model_loading";
+import { loadModels, type FromLoading } from "./model_loading";
 import { modelUnits } from "./units";
 
 type Buildings = Extract<FromLoading, { kind: "buildings" }>;

@@ -19,7 +19,7 @@ import type { Hooks } from "../page/view";
 import { ModelScene } from "../scene/scene";
 import { ViewTools } from "../tools/view_tools";
 import { counted } from "../words/numbers";
-import { CATEGORIES, CATEGORY_NAMES, type Category } from "../words/roof_types";
+import { CATEGORIES, CATEGORY_NAMES } from "../words/roof_types";
 import { BuildingList, tallyWords } from "./building_list";
 import { changed, FilterPanel } from "./filter_panel";
 import { Legend } from "./legend";
@@ -65,7 +65,7 @@ class ResultsView {
   private colouring: Colouring = "type";
   private readonly stage: HTMLElement;
   private readonly map = new OutlineMap((id) => this.open(id));
-  private background: Promise<void> | null = null;
+  private isLaid = false;
   private readonly top = button("Top", () => this.scene?.top(), { title: "From above, north up (t)" });
   private readonly modes = {
     "3d": button("3D", () => this.change({ ...this.wanted, map: false })),
@@ -298,13 +298,10 @@ class ResultsView {
     if (!wanted || element.isConnected) return;
     this.stage.prepend(element);
     this.map.select(this.selected, this.selected !== null);
-    await (this.background ??= this.layBackground());
-  }
-
-  private async layBackground(): Promise<void> {
-    if (document.querySelector('meta[name="map-tiles"]') === null) return;
+    if (this.isLaid || document.querySelector('meta[name="map-tiles"]') === null) return;
     const { layBackground } = await import("../map/background");
     await layBackground(this.map, this.objects, this.calledOff.signal);
+    this.isLaid = true;
   }
 
   /** Colour the map as the models are, also objects that are still to come. */
