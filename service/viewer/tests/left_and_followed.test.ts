@@ -32,14 +32,14 @@ vi.mock("../src/scene/scene", () => ({
     has = (): boolean => true;
     groundAt = (): number => 0;
     terrain: Ground | null = null;
-    layTerrain(terrain: Ground): void {
+    lay(terrain: Ground): void {
       this.terrain = terrain;
     }
     add(): void {}
     finish(): void {}
     showOnly(): void {}
     tint(): void {}
-    watchCamera(): void {}
+    readonly camera = { watch: (): void => undefined, look: (): void => undefined };
     dispose(): void {}
   },
 }));

@@ -232,13 +232,13 @@ class Changes implements View {
     // the frames differ by a shift: the cameras differ by it, too
     const [x, y, z] = shift;
     const by = { x, y, z };
-    const toRight: OnMove = (position, target) => right.look(position.clone().sub(by), target.clone().sub(by));
-    const toLeft: OnMove = (position, target) => left.look(position.clone().add(by), target.clone().add(by));
+    const toRight: OnMove = (position, target) => right.camera.look(position.clone().sub(by), target.clone().sub(by));
+    const toLeft: OnMove = (position, target) => left.camera.look(position.clone().add(by), target.clone().add(by));
     // an empty side has no view of its own
     const [first, second] = loaded[0].batches.length > 0 ? [left, toRight] : [right, toLeft];
-    first.watchCamera(second, true);
-    left.watchCamera(toRight);
-    right.watchCamera(toLeft);
+    first.camera.watch(second, true);
+    left.camera.watch(toRight);
+    right.camera.watch(toLeft);
     canvases.forEach((canvas) => (canvas.dataset["ready"] = "true"));
   }
 

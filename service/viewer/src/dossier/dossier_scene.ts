@@ -22,6 +22,7 @@ import {
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 import { buildingMesh, type BuildingMesh, type SceneFrame } from "../models/building_mesh";
 import type { Building } from "../models/cityjson";
+import { onKeys } from "../page/elements";
 import { pointColour, type Colouring } from "./dossier_drawings";
 import type { Points } from "./dossier_geometry";
 
@@ -70,7 +71,14 @@ export class DossierScene {
     const distance = Math.max(2, bounds.getSize(new Vector3()).length() / 2.3 / Math.sin((FOV_DEG * Math.PI) / 360));
     this.camera.position.copy(this.controls.target).addScaledVector(START, distance);
     this.controls.addEventListener("change", () => this.request());
-    canvas.addEventListener("keydown", (event) => this.typed(event));
+    onKeys(canvas, {
+      ArrowLeft: () => this.controls.rotateLeft(0.15),
+      ArrowRight: () => this.controls.rotateLeft(-0.15),
+      ArrowUp: () => this.controls.rotateUp(0.12),
+      ArrowDown: () => this.controls.rotateUp(-0.12),
+      "+": () => this.controls.dollyIn(0.85),
+      "-": () => this.controls.dollyOut(0.85),
+    });
     this.watch = new ResizeObserver(() => this.resize());
     this.watch.observe(canvas);
     this.colour(colouring);
@@ -107,22 +115,6 @@ export class DossierScene {
     const lines = new BufferGeometry();
     lines.setAttribute("position", new BufferAttribute(Float32Array.from(edges), 3));
     this.scene.add(new Mesh(geometry, surface), new LineSegments(lines, new LineBasicMaterial({ color: "#39424b" })));
-  }
-
-  private typed(event: KeyboardEvent): void {
-    const { controls } = this;
-    const keys: Record<string, () => void> = {
-      ArrowLeft: () => controls.rotateLeft(0.15),
-      ArrowRight: () => controls.rotateLeft(-0.15),
-      ArrowUp: () => controls.rotateUp(0.12),
-      ArrowDown: () => controls.rotateUp(-0.12),
-      "+": () => controls.dollyIn(0.85),
-      "-": () => controls.dollyOut(0.85),
-    };
-    const action = keys[event.key];
-    if (action === undefined) return;
-    event.preventDefault();
-    action();
   }
 
   private resize(): void {

@@ -2,7 +2,7 @@
 
 import type { Outlines } from "../models/outlines";
 import { boxAround, united, type Box } from "../models/plan";
-import { el } from "../page/elements";
+import { el, onKeys } from "../page/elements";
 import { CATEGORIES, CATEGORY_NAMES, isFlat, type Category } from "../words/roof_types";
 import { MapView, scaleBar } from "./map_view";
 import "./outline_map.css";
@@ -74,7 +74,17 @@ export class OutlineMap {
     canvas.addEventListener("pointerup", (event) => this.released(event));
     canvas.addEventListener("pointercancel", (event) => this.released(event));
     canvas.addEventListener("wheel", (event) => this.wheeled(event), { passive: false });
-    canvas.addEventListener("keydown", (event) => this.typed(event));
+    onKeys(canvas, {
+      ArrowLeft: () => this.pan(STEP_PX, 0),
+      ArrowRight: () => this.pan(-STEP_PX, 0),
+      ArrowUp: () => this.pan(0, STEP_PX),
+      ArrowDown: () => this.pan(0, -STEP_PX),
+      "+": () => this.zoom(1.4),
+      "=": () => this.zoom(1.4),
+      "-": () => this.zoom(1 / 1.4),
+      f: () => this.fit(),
+      Escape: () => onPick(null),
+    });
     this.dark.addEventListener("change", this.request);
     this.watch = new ResizeObserver(() => this.resize());
     this.watch.observe(this.element);
@@ -307,25 +317,6 @@ export class OutlineMap {
     const { x, y } = this.inView(event);
     const pixels = event.deltaMode === WheelEvent.DOM_DELTA_PIXEL ? event.deltaY : event.deltaY * 30;
     this.zoom(Math.exp(-0.0018 * Math.min(Math.max(pixels, -400), 400)), x, y);
-  }
-
-  private typed(event: KeyboardEvent): void {
-    const action = (
-      {
-        ArrowLeft: () => this.pan(STEP_PX, 0),
-        ArrowRight: () => this.pan(-STEP_PX, 0),
-        ArrowUp: () => this.pan(0, STEP_PX),
-        ArrowDown: () => this.pan(0, -STEP_PX),
-        "+": () => this.zoom(1.4),
-        "=": () => this.zoom(1.4),
-        "-": () => this.zoom(1 / 1.4),
-        f: () => this.fit(),
-        Escape: () => this.onPick(null),
-      } as Record<string, () => void>
-    )[event.key];
-    if (action === undefined || event.ctrlKey || event.metaKey || event.altKey) return;
-    event.preventDefault();
-    action();
   }
 
   /** The smallest object at a place of the map; a very small one also takes what is near it. */

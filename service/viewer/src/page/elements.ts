@@ -32,6 +32,20 @@ export function button(words: string, act: (() => void) | null, properties: Prop
   return el("button", { type: "button", ...properties, onclick: act }, words);
 }
 
+/** Whether a button is pressed, or to press it or release it. */
+export const isPressed = (one: HTMLElement): boolean => one.getAttribute("aria-pressed") === "true";
+export const setPressed = (one: HTMLElement, pressed: boolean): void => one.setAttribute("aria-pressed", String(pressed));
+
+/** What keys do in an element; with Ctrl, Alt or the like they do what they do anywhere. */
+export function onKeys(element: HTMLElement, keys: Readonly<Record<string, () => void>>): void {
+  element.addEventListener("keydown", (event) => {
+    const action = keys[event.key];
+    if (action === undefined || event.ctrlKey || event.metaKey || event.altKey) return;
+    event.preventDefault();
+    action();
+  });
+}
+
 /** Put something else into a place; a link that has the focus keeps it. */
 export function refill(place: HTMLElement, ...content: Child[]): void {
   const focused = place.contains(document.activeElement) ? document.activeElement?.getAttribute("href") : null;

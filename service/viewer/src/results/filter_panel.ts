@@ -1,7 +1,7 @@
 import { COLUMNS, factorOf } from "../models/columns";
 import { FIGURE_NAMES, FIGURES, FLAG_NAMES, FLAGS, type FigureName } from "../models/figures";
 import { isFiltered, SORTS, STATUSES, unfiltered, type Range, type Sort, type Wanted } from "../models/selection";
-import { button, el, swatch } from "../page/elements";
+import { button, el, setPressed, swatch } from "../page/elements";
 import { Tick } from "../page/tick";
 import { capital } from "../words/fields";
 import { count } from "../words/numbers";
@@ -113,11 +113,10 @@ export class FilterPanel {
     this.direction.title = capital(order);
     const isShown = (chosen: Category[]): boolean =>
       [...categories.keys()].every((name) => hidden.has(name) !== chosen.includes(name));
-    this.buildings.setAttribute("aria-pressed", String(isShown(BUILDINGS)));
-    this.without.setAttribute("aria-pressed", String(isShown(WITHOUT)));
     const sum = (chosen: Category[]): number => chosen.reduce((n, name) => n + (categories.get(name) ?? 0), 0);
-    for (const [button, label, chosen] of [[this.buildings, "Buildings", BUILDINGS], [this.without, "Without a model", WITHOUT]] as const) {
-      button.replaceChildren(`${label} `, el("span", { class: "tally" }, count(sum(chosen))));
+    for (const [choice, label, chosen] of [[this.buildings, "Buildings", BUILDINGS], [this.without, "Without a model", WITHOUT]] as const) {
+      setPressed(choice, isShown(chosen));
+      choice.replaceChildren(`${label} `, el("span", { class: "tally" }, count(sum(chosen))));
     }
     for (const [name, box] of this.categories) {
       box.set(!hidden.has(name), categories.get(name) ?? 0);

@@ -13,7 +13,7 @@ import { RunObjects } from "../models/run_objects";
 import { isFiltered, queryWith, selected, tallies, USUAL, wantedOf, type Wanted } from "../models/selection";
 import { elevationUnitM } from "../models/units";
 import { addressOf, placeOf, queryOf, type Place } from "../page/address";
-import { button, el } from "../page/elements";
+import { button, el, setPressed } from "../page/elements";
 import { announce, asProblem, report, warningNotice } from "../page/notices";
 import type { Hooks } from "../page/view";
 import { ModelScene } from "../scene/scene";
@@ -56,7 +56,7 @@ class ResultsView {
   private readonly filters = new FilterPanel((wanted) => this.change(wanted));
   private readonly legend: Legend;
   private readonly levels = new LevelChoice((lod) => void this.showLevel(lod));
-  private readonly viewTools = new ViewTools();
+  private readonly viewTools: ViewTools;
   private readonly objects: RunObjects;
   private loadingRejected: Promise<void> | null = null;
   private wanted: Wanted = USUAL;
@@ -86,6 +86,7 @@ class ResultsView {
     this.method = named ?? this.methods[0] ?? null;
     this.jobPath = pathOfJob(job.jobID);
     this.objects = new RunObjects(this.jobPath, this.method);
+    this.viewTools = new ViewTools(this.objects);
     this.list = new BuildingList((id) => this.address(id));
     this.legend = new Legend(
       (category, visible) => {
@@ -211,7 +212,7 @@ class ResultsView {
       return;
     }
     announce(`${counted(this.objects.listed.length, "building")} loaded.`);
-    const offered = this.viewTools.offerPoints(this.jobPath, this.method, this.objects.frame);
+    const offered = this.viewTools.offerPoints();
     if (this.objects.counts.has("failed")) {
       await offered; // outlines lie on the terrain
       try {
@@ -287,8 +288,8 @@ class ResultsView {
 
   /** Show the map in place of the 3D view, or the 3D view. */
   private async showMap(wanted: boolean): Promise<void> {
-    this.modes["3d"].setAttribute("aria-pressed", String(!wanted));
-    this.modes.map.setAttribute("aria-pressed", String(wanted));
+    setPressed(this.modes["3d"], !wanted);
+    setPressed(this.modes.map, wanted);
     this.top.hidden = wanted;
     this.canvas.hidden = wanted;
     this.levels.element.classList.toggle("levels-away", wanted);
@@ -317,19 +318,16 @@ class ResultsView {
   /** The choice of the method whose models are shown, and the link to the page with all methods. */
   private comparison(): HTMLElement[] {
     if (this.methods.length === 0) return [];
-    const choice = el(
-      "select",
-      { "aria-label": "Models of the method" },
-      ...this.methods.map((label) => el("option", { value: label, selected: label === this.method }, label)),
-    );
-    choice.addEventListener("change", () => {
-      // the same building by another method
-      location.hash = addressOf({ job: this.job.jobID, method: choice.value, building: this.selected }, queryOf(location.hash));
-    });
+    // the same building by another method
+    const follow = (): void => {
+      location.hash = addressOf({ job: this.job.jobID, method: select.value, building: this.selected }, queryOf(location.hash));
+    };
+    const options = this.methods.map((label) => el("option", { value: label, selected: label === this.method }, label));
+    const select = el("select", { "aria-label": "Models of the method", onchange: follow }, ...options);
     const hasPage = this.job.links?.some(({ type }) => type === "text/html") === true;
     const page = pageLink(this.jobPath, "The methods side by side");
     page.classList.add("button", "quiet");
-    return hasPage ? [choice, page] : [choice];
+    return hasPage ? [select, page] : [select];
   }
 
   // --- the record of one building

@@ -47,7 +47,7 @@ export class Camera {
   }
 
   /** Call a function whenever the camera has moved, but not after `look`; `atOnce` also now. */
-  watch(onMove: OnMove, atOnce: boolean): void {
+  watch(onMove: OnMove, atOnce = false): void {
     this.onMove = onMove;
     this.known = this.words();
     if (atOnce) onMove(this.view.position, this.navigation.target);

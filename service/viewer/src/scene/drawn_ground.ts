@@ -27,9 +27,8 @@ export class DrawnGround {
   }
 
   /** Distance along a ray of unit direction; infinity if it does not meet it. */
-  distance({ origin, direction }: Ray): number {
-    if (this.heights === null) return Infinity;
-    return groundDistance(this.heights, origin.toArray(), direction.toArray()) ?? Infinity;
+  distance(ray: Ray): number {
+    return this.heights === null ? Infinity : groundDistance(this.heights, ray);
   }
 
   dispose(): void {

@@ -3,7 +3,7 @@
 import { Color, PCFShadowMap, Scene, Vector2, Vector3, WebGLRenderer, type Ray } from "three";
 import type { Batch } from "../models/batching";
 import type { Colouring } from "../models/colouring";
-import { Camera, TAN_HALF_FOV, type OnMove } from "./camera";
+import { Camera, TAN_HALF_FOV } from "./camera";
 import { DrawnGround } from "./drawn_ground";
 import { DrawnModels } from "./drawn_models";
 import { groundThrough, type Ground } from "./ground";
@@ -27,7 +27,7 @@ export class ModelScene {
   private readonly light = new Light();
   private readonly models = new DrawnModels();
   private readonly ground = new DrawnGround();
-  private readonly camera: Camera;
+  readonly camera: Camera;
   private readonly pointing: Pointing;
   private readonly layers = new Set<Layer>();
   private readonly watch: ResizeObserver;
@@ -95,12 +95,8 @@ export class ModelScene {
     this.lay(groundThrough(this.models.floors(), box, 160), true);
   }
 
-  /** Draw the measured terrain in place of a ground that is guessed from the floors. */
-  layTerrain(terrain: Ground): void {
-    this.lay(terrain, false);
-  }
-
-  private lay(ground: Ground, isGuessed: boolean): void {
+  /** Draw this ground from now on. */
+  lay(ground: Ground, isGuessed: boolean): void {
     this.ground.lay(ground, isGuessed);
     this.paint();
     this.settle();
@@ -172,16 +168,6 @@ export class ModelScene {
     const box = this.models.select(id);
     if (fly && box !== null) this.camera.approach(box);
     this.request();
-  }
-
-  /** Call a function with position and target of the camera whenever it has moved, but not after `look`; `atOnce` also now. */
-  watchCamera(onMove: OnMove, atOnce = false): void {
-    this.camera.watch(onMove, atOnce);
-  }
-
-  /** Look as another scene does; above the own ground in any case. */
-  look(position: Vector3, target: Vector3): void {
-    this.camera.look(position, target);
   }
 
   /** See everything. */

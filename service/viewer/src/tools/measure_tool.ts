@@ -1,6 +1,7 @@
 import type { Vector3 } from "three";
-import { el } from "../page/elements";
+import { button, el, setPressed } from "../page/elements";
 import { announce } from "../page/notices";
+import { facts } from "../page/tables";
 import type { Tool } from "../scene/layer";
 import type { ModelScene } from "../scene/scene";
 import { MeasureDrawing } from "./measure_drawing";
@@ -11,7 +12,7 @@ const FINE_PX = 1; // the same with Shift
 
 /** Measures between two places: two clicks or taps, or a cross that the arrow keys move and Enter sets. */
 export class MeasureTool implements Tool {
-  readonly button = el("button", { type: "button", title: "Measure distances and heights (m)", "aria-pressed": "false" }, "Measure");
+  readonly button = button("Measure", () => this.toggle(), { title: "Measure distances and heights (m)", "aria-pressed": "false" });
   readonly card = el("section", { class: "stage-card measure", "aria-label": "Measurement", hidden: true });
   /** The place where the keyboard sets. */
   readonly cross = el("div", { class: "cross", "aria-hidden": "true", hidden: true });
@@ -23,11 +24,9 @@ export class MeasureTool implements Tool {
   constructor(
     private readonly scene: ModelScene,
     private readonly canvas: HTMLCanvasElement,
-  ) {
-    this.button.addEventListener("click", () => this.toggle());
-  }
+  ) {}
 
-  toggle(): void {
+  private toggle(): void {
     if (this.on) this.end();
     else this.begin();
   }
@@ -40,7 +39,7 @@ export class MeasureTool implements Tool {
     this.scene.use(null);
     this.scene.removeLayer(this.drawing);
     document.removeEventListener("keydown", this.escaped, true);
-    this.button.setAttribute("aria-pressed", "false");
+    setPressed(this.button, false);
     this.card.hidden = this.cross.hidden = true;
     announce("Measuring has ended.");
   }
@@ -82,7 +81,7 @@ export class MeasureTool implements Tool {
     this.scene.use(this);
     this.scene.addLayer(this.drawing);
     document.addEventListener("keydown", this.escaped, true);
-    this.button.setAttribute("aria-pressed", "true");
+    setPressed(this.button, true);
     this.card.hidden = false;
     this.drawing.show([]);
     this.write([]);
@@ -110,8 +109,7 @@ export class MeasureTool implements Tool {
       this.card.replaceChildren(el("p", {}, hint, el("span", { class: "hint" }, " · Esc ends")));
       return;
     }
-    const rows = inWords(measured(from.toArray(), to.toArray())).flatMap(([name, figure]) => [el("dt", {}, name), el("dd", {}, figure)]);
-    this.card.replaceChildren(el("dl", {}, ...rows));
+    this.card.replaceChildren(facts({}, ...inWords(measured(from.toArray(), to.toArray()))));
   }
 
   private underCross(): Vector3 | null {

@@ -1,5 +1,6 @@
 import { ofRun, Problem, request, serviceUrl } from "../api/requests";
 import { originInMetres, type SceneFrame } from "../models/building_mesh";
+import type { RunObjects } from "../models/run_objects";
 import { colourSwatch, el } from "../page/elements";
 import { choice } from "../page/form_fields";
 import { announce, asProblem, problemNotice } from "../page/notices";
@@ -28,10 +29,9 @@ export class PointsPanel {
    *
    * @throws Problem if the service does not give it, Error if it cannot be read.
    */
-  static async open(scene: ModelScene, jobPath: string, method: string | null, frame: SceneFrame): Promise<PointsPanel> {
+  static async open(scene: ModelScene, { jobPath, method, frame }: RunObjects): Promise<PointsPanel> {
     const get = async (address: string, signal?: AbortSignal): Promise<ArrayBuffer> => {
-      const options: RequestInit = { headers: { Accept: "*/*" }, cache: "default" };
-      if (signal !== undefined) options.signal = signal;
+      const options = { headers: { Accept: "*/*" }, cache: "default" as const, signal: signal ?? null };
       return (await request(ofRun(address, method), options)).arrayBuffer();
     };
     const address = serviceUrl(`${jobPath}/points/tileset.json`);
