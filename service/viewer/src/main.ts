@@ -1,27 +1,28 @@
 /** The page: it shows what the address names. */
 
-import { currentKey, getJson, keepKey, Problem } from "./api/requests";
+import { currentKey, KEY_NEEDED, keepKey, Problem } from "./api/requests";
 import { JobList } from "./jobs/job_list";
 import { partsOf, placeOf } from "./page/address";
 import { openForm, type Opened } from "./page/dialogs";
 import { byId, el } from "./page/elements";
 import { field } from "./page/form_fields";
 import { problemNotice } from "./page/notices";
-import type { View } from "./page/view";
+import { jobsChanged, type View } from "./page/view";
 import { showJob } from "./progress/job_view";
 import { Submission } from "./submit/submission";
 import { hasView, showView } from "./views";
 import "./frame.css";
 
 const main = byId("main");
-const jobs = new JobList(byId("jobs"), onProblem);
-new Submission(byId("submission"), (jobId) => {
-  jobs.refresh();
+const jobs = new JobList(byId("jobs"));
+const submitted = (jobId: string): void => {
+  jobsChanged();
   location.hash = `#/jobs/${jobId}`;
-}, onProblem);
+};
+// files are sent in a way of their own
+new Submission(byId("submission"), submitted, (problem) => problem.status === 401 && askForKey(problem));
 
 let shown = "";
-let leave: () => void = () => undefined;
 let view: View | null = null;
 
 function route(): void {
@@ -36,37 +37,28 @@ function route(): void {
     if (isHere) link.setAttribute("aria-current", "page");
     else link.removeAttribute("aria-current");
   }
-  // only the building or the query changed: the view handles that itself
   const now = place !== null ? `${place.job} ${place.method ?? ""}` : isView ? `/${[address.name, ...address.rest].join("/")}` : "";
-  if (now === shown && place !== null) return;
   if (now === shown && view !== null) {
-    view.follow(address);
+    view.follow(address); // only the building or the query changed
     return;
   }
-  leave();
+  view?.leave();
   shown = now;
   view = null;
   main.scrollTop = 0;
-  const hooks = { onChange: () => jobs.refresh(), onProblem };
   if (place !== null) {
-    leave = showJob(main, place, hooks);
+    view = showJob(main, place);
   } else if (isView) {
-    view = showView(main, address, hooks);
-    leave = view.leave;
+    view = showView(main, address);
   } else {
     document.title = "gablework";
     main.replaceChildren(byId<HTMLTemplateElement>("welcome").content.cloneNode(true));
-    leave = () => undefined;
   }
-}
-
-/** Ask for a key that is missing or refused; show all other problems where they happened. */
-function onProblem(problem: Problem): void {
-  if (problem.status === 401) askForKey(problem);
 }
 
 let asking: Opened | null = null;
 
+/** Ask for a key that is missing or refused. */
 function askForKey(problem: Problem | null): void {
   if (asking?.element.isConnected === true) return;
   if (problem !== null && currentKey() !== null) {
@@ -84,14 +76,10 @@ function askForKey(problem: Problem | null): void {
       keepKey(key.value);
       location.reload();
     },
-    onProblem,
   });
 }
 
 byId("key-button").addEventListener("click", () => askForKey(null));
+document.addEventListener(KEY_NEEDED, ({ detail }) => askForKey(detail));
 window.addEventListener("hashchange", route);
 route();
-jobs.refresh();
-void getJson("processes/reconstruct").catch((error: unknown) => {
-  if (error instanceof Problem) onProblem(error);
-});

@@ -65,7 +65,6 @@ const buildings = (...objects: Listed[]): FromLoading => ({
   outlines: { ids: [], categories: [], shapeStarts: new Uint32Array(1), ringStarts: new Uint32Array(1), xy: new Float32Array() },
 });
 
-const hooks = { onChange: vi.fn(), onProblem: vi.fn() };
 let service: FakeService;
 let place: HTMLElement;
 let leave: () => void = () => undefined;
@@ -110,7 +109,7 @@ describe("the results of a job", () => {
 
   async function open(building: string | null, query = ""): Promise<void> {
     await go(`#/jobs/1${building === null ? "" : `/buildings/${building}`}${query}`);
-    leave = showResults(place, JOB, { job: "1", method: null, building }, hooks);
+    leave = showResults(place, JOB, { job: "1", method: null, building });
     await settled();
   }
 
@@ -223,20 +222,19 @@ describe("two runs side by side", () => {
   test("are not reported as a fault when others are chosen while they load", async () => {
     const held = service.hold("GET jobs/1/results/report");
     location.hash = two;
-    const view = showChanges(place, partsOf(two), hooks);
+    const view = showChanges(place, partsOf(two));
     leave = () => view.leave();
     await settled();
     view.follow(partsOf(hashOf(["changes"], { old: "2", new: "3" })));
     held.give({ body: {} });
     await settled();
     expect(place.querySelector("[role=alert]")).toBeNull();
-    expect(hooks.onProblem).not.toHaveBeenCalled();
     expect(place.querySelectorAll("canvas[data-ready]")).toHaveLength(2);
   });
 
   test("fly to a building of the list after a click on the chosen model", async () => {
     location.hash = two;
-    const view = showChanges(place, partsOf(two), hooks);
+    const view = showChanges(place, partsOf(two));
     leave = () => view.leave();
     await settled();
     const follow = (): void => view.follow(partsOf(location.hash));

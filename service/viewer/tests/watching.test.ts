@@ -6,7 +6,6 @@ import { showSchedules } from "../src/service/schedules_view";
 import { showWebhooks } from "../src/service/webhooks_view";
 import { FakeService, press, settled } from "./fake_service";
 
-const hooks = { onChange: vi.fn(), onProblem: vi.fn() };
 let service: FakeService;
 let place: HTMLElement;
 
@@ -45,7 +44,7 @@ const VIEWS = [
     action: "PATCH schedules/s",
     open: () => {
       service.on("GET schedules?limit=25&offset=0", { schedules: [SCHEDULE], links: [] });
-      return showSchedules(place, partsOf("#/schedules"), hooks);
+      return showSchedules(place, partsOf("#/schedules"));
     },
     act: () => choose("nightly", "Pause"),
   },
@@ -56,7 +55,7 @@ const VIEWS = [
     open: () => {
       service.on("GET schedules/s", SCHEDULE);
       service.on("GET schedules/s/runs?limit=25&offset=0", { runs: [], links: [] });
-      return showSchedules(place, partsOf("#/schedules/s"), hooks);
+      return showSchedules(place, partsOf("#/schedules/s"));
     },
     act: () => choose("nightly", "Pause"),
   },
@@ -66,7 +65,7 @@ const VIEWS = [
     action: "PATCH jobs/1",
     open: () => {
       service.on(JOBS, RUNNING);
-      return showHistory(place, partsOf("#/jobs"), hooks);
+      return showHistory(place, partsOf("#/jobs"));
     },
     act: () => choose("a town", "Keep it"),
   },
@@ -77,7 +76,7 @@ const VIEWS = [
     open: () => {
       service.on(LOG, { deliveries: [DELIVERY], links: [] });
       service.on(RECEIVERS, { webhooks: [RECEIVER], eventTypes: [] });
-      return showWebhooks(place, partsOf("#/webhooks"), hooks);
+      return showWebhooks(place, partsOf("#/webhooks"));
     },
     act: () => choose("ours", "Send what it missed"),
   },
@@ -87,7 +86,7 @@ const VIEWS = [
     action: "POST webhooks/deliveries/d/replay",
     open: () => {
       service.on("GET webhooks/deliveries/d", DELIVERY);
-      return showWebhooks(place, partsOf("#/webhooks/deliveries/d"), hooks);
+      return showWebhooks(place, partsOf("#/webhooks/deliveries/d"));
     },
     act: () => press("Send again"),
   },
@@ -113,7 +112,7 @@ for (const { name, reads, action, open, act } of VIEWS) {
 test("a list with a job under way is read again while the service is away, and its notice stays one", async () => {
   vi.useFakeTimers();
   service.on(JOBS, RUNNING);
-  const view = showHistory(place, partsOf("#/jobs"), hooks);
+  const view = showHistory(place, partsOf("#/jobs"));
   await vi.advanceTimersByTimeAsync(1000);
   expect(place.querySelectorAll("tbody tr")).toHaveLength(1);
   vi.stubGlobal("fetch", () => Promise.reject(new TypeError("no network")));
@@ -135,7 +134,7 @@ test("a list with a job under way is read again while the service is away, and i
 test("a view that was left is not read again by the clock", async () => {
   vi.useFakeTimers();
   service.on(JOBS, RUNNING);
-  const view = showHistory(place, partsOf("#/jobs"), hooks);
+  const view = showHistory(place, partsOf("#/jobs"));
   await vi.advanceTimersByTimeAsync(4500);
   expect(service.count(JOBS)).toBe(2);
   view.leave();

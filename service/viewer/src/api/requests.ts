@@ -5,6 +5,15 @@ import type { Preflight, RunReport, Status, UploadInfo } from "./types";
 
 const KEY = "gablework.key";
 
+/** The event of the document when a request needed a key, or another one; its detail is the problem. */
+export const KEY_NEEDED = "key-needed";
+
+declare global {
+  interface DocumentEventMap {
+    [KEY_NEEDED]: CustomEvent<Problem>;
+  }
+}
+
 /** An error from the service as application/problem+json, or from the network. */
 export class Problem extends Error {
   constructor(
@@ -74,7 +83,9 @@ export async function request(path: string, options: RequestInit = {}): Promise<
     throw unreachable();
   }
   if (response.ok) return response;
-  throw problemOf(response.status, response.statusText, await response.text(), response.headers.get("Retry-After"));
+  const problem = problemOf(response.status, response.statusText, await response.text(), response.headers.get("Retry-After"));
+  if (problem.status === 401) document.dispatchEvent(new CustomEvent(KEY_NEEDED, { detail: problem }));
+  throw problem;
 }
 
 export async function getJson<T>(path: string, options: RequestInit = {}): Promise<T> {

@@ -14,7 +14,7 @@ import { announce, report, warningNotice } from "../page/notices";
 import { sheet } from "../page/sheet";
 import { nothing, table, type Column } from "../page/tables";
 import { Tick } from "../page/tick";
-import type { Hooks, View } from "../page/view";
+import type { View } from "../page/view";
 import type { OnMove } from "../scene/camera";
 import { ModelScene } from "../scene/scene";
 import { count, counted, measure } from "../words/numbers";
@@ -36,8 +36,8 @@ interface Loaded {
   batches: Batch[];
 }
 
-export function showChanges(place: HTMLElement, address: Address, hooks: Hooks): View {
-  const view = new Changes(place, hooks);
+export function showChanges(place: HTMLElement, address: Address): View {
+  const view = new Changes(place);
   view.follow(address);
   return view;
 }
@@ -76,10 +76,7 @@ class Changes implements View {
     { head: "Right", kind: "only-wide", cell: (pair) => figures(pair.new) },
   ];
 
-  constructor(
-    place: HTMLElement,
-    private readonly hooks: Hooks,
-  ) {
+  constructor(place: HTMLElement) {
     const [old, now] = this.selects;
     for (const select of this.selects) select.addEventListener("change", () => this.choose());
     const swap = (): void => {
@@ -110,7 +107,7 @@ class Changes implements View {
     const { signal } = (this.calledOff = new AbortController());
     this.load(signal).catch((error: unknown) => {
       if (signal.aborted) return;
-      report(this.note, error, this.hooks.onProblem, () => {
+      report(this.note, error, () => {
         this.shownSides = "";
         this.follow(partsOf(location.hash));
       });

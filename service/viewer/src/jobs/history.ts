@@ -7,7 +7,7 @@ import { el } from "../page/elements";
 import { choice, field, searchForm } from "../page/form_fields";
 import { sheet } from "../page/sheet";
 import { chip, type Column } from "../page/tables";
-import type { Hooks, View } from "../page/view";
+import { JOBS_CHANGED, type View } from "../page/view";
 import { WatchedList, type Answer } from "../page/watched_list";
 import { counted } from "../words/numbers";
 import { jobMenu } from "./job_actions";
@@ -15,8 +15,8 @@ import { durationWords, PROCESS_WORDS, processWords, resultWords, STATUS_WORDS, 
 
 const PAUSE_MS = 300; // in typing, before the search begins
 
-export function showHistory(place: HTMLElement, address: Address, hooks: Hooks): View {
-  const view = new History(place, hooks);
+export function showHistory(place: HTMLElement, address: Address): View {
+  const view = new History(place);
   view.follow(address);
   return view;
 }
@@ -39,8 +39,9 @@ class History extends WatchedList<StatusInfo> {
       title: ({ created }) => (created === undefined ? undefined : new Date(created).toLocaleString()),
     },
     { head: "Took", kind: "only-wide figure", cell: durationWords },
-    { head: "Actions", kind: "acts", cell: (job) => jobMenu(job, { ...this.hooks, onChange: () => this.changed() }) },
+    { head: "Actions", kind: "acts", cell: (job) => jobMenu(job) },
   ];
+  private readonly changed = (): void => void this.load(false);
   private typing: number | undefined;
   private readonly words = el("input", { type: "search", id: "history-words", maxlength: 200, autocomplete: "off" });
   private readonly status = choice("history-status", { "": "any", ...STATUS_WORDS });
@@ -48,9 +49,10 @@ class History extends WatchedList<StatusInfo> {
   private readonly tally = el("p", { class: "hint" });
   private readonly only = el("div");
 
-  constructor(place: HTMLElement, hooks: Hooks) {
+  constructor(place: HTMLElement) {
     const filters = ["q", "status", "processID", "scheduleID"];
-    super(hooks, { name: "Jobs", path: "jobs", member: "jobs", words: ["jobs"], filters, refreshMs: 4000 });
+    super({ name: "Jobs", path: "jobs", member: "jobs", words: ["jobs"], filters, refreshMs: 4000 });
+    document.addEventListener(JOBS_CHANGED, this.changed);
     this.words.addEventListener("input", () => {
       clearTimeout(this.typing);
       this.typing = window.setTimeout(() => this.search(), PAUSE_MS);
@@ -76,6 +78,7 @@ class History extends WatchedList<StatusInfo> {
 
   override leave(): void {
     clearTimeout(this.typing);
+    document.removeEventListener(JOBS_CHANGED, this.changed);
     super.leave();
   }
 
@@ -114,11 +117,6 @@ class History extends WatchedList<StatusInfo> {
 
   protected mayChange({ status }: StatusInfo): boolean {
     return !isOver(status);
-  }
-
-  private changed(): void {
-    this.hooks.onChange();
-    void this.load(false);
   }
 }
 

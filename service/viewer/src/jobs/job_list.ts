@@ -1,8 +1,9 @@
-import { getJson, isOver, pathOfJob, type Problem } from "../api/requests";
+import { getJson, isOver, pathOfJob } from "../api/requests";
 import type { StatusInfo } from "../api/types";
 import { hashOf } from "../page/address";
 import { el, refill } from "../page/elements";
 import { chip } from "../page/tables";
+import { JOBS_CHANGED } from "../page/view";
 import { Watching } from "../page/watching";
 import { pageLink } from "./downloads";
 import { statusWords, titleOf, whenWords } from "./job_words";
@@ -18,12 +19,10 @@ export class JobList extends Watching {
   private readonly none = el("p", { class: "hint", hidden: true }, "None yet. Jobs stay here after a reload.");
   private readonly all = el("a", { class: "all-jobs", href: "#/jobs", hidden: true }, "All jobs");
 
-  constructor(place: HTMLElement, onProblem: (problem: Problem) => void) {
-    super({ onChange: () => undefined, onProblem }, REFRESH_MS);
+  constructor(place: HTMLElement) {
+    super(REFRESH_MS);
+    document.addEventListener(JOBS_CHANGED, () => void this.load());
     place.replaceChildren(el("h2", { id: "jobs-title" }, "Jobs"), this.note, this.none, this.list, this.all);
-  }
-
-  refresh(): void {
     void this.load();
   }
 

@@ -4,7 +4,7 @@ import { openForm } from "../page/dialogs";
 import { el } from "../page/elements";
 import { Boxes, choice } from "../page/form_fields";
 import { announce } from "../page/notices";
-import type { Hooks } from "../page/view";
+import { jobsChanged } from "../page/view";
 import { titleOf } from "./job_words";
 import { changes, flat } from "./settings_changes";
 import { SettingsEditor } from "./settings_editor";
@@ -24,7 +24,7 @@ interface Field {
 }
 
 /** Open the form that starts a job again, with changes. The inputs are those that the process describes. */
-export async function openRetry(job: StatusInfo, hooks: Hooks): Promise<void> {
+export async function openRetry(job: StatusInfo): Promise<void> {
   const process = job.processID ?? "reconstruct";
   const { inputs } = await getJson<{ inputs: Record<string, InputDescription> }>(`processes/${encodeURIComponent(process)}`);
   const before = job.request?.inputs ?? {};
@@ -58,10 +58,9 @@ export async function openRetry(job: StatusInfo, hooks: Hooks): Promise<void> {
       const response = await sendJson("POST", `${pathOfJob(job.jobID)}/retry`, { inputs: given });
       const { jobID } = (await response.json()) as StatusInfo;
       announce("The new job is submitted.");
-      hooks.onChange();
+      jobsChanged();
       location.hash = `#/jobs/${jobID}`;
     },
-    onProblem: hooks.onProblem,
   });
 }
 

@@ -1,4 +1,3 @@
-import type { Problem } from "../api/requests";
 import { button, el } from "./elements";
 import { asProblem, problemNotice } from "./notices";
 import "./action_menu.css";
@@ -33,9 +32,8 @@ export function dropDown(opener: HTMLElement, content: HTMLElement, kind = ""): 
  *
  * @param name What the actions are for, for screen readers.
  * @param items The entries at the time at which it is opened.
- * @param onProblem Gets what went wrong; the menu shows it, too.
  */
-export function actionMenu(name: string, items: () => Item[], onProblem: (problem: Problem) => void): HTMLElement {
+export function actionMenu(name: string, items: () => Item[]): HTMLElement {
   const list = el("div");
   const opener = el("summary", { class: "button quiet", "aria-label": `Actions for ${name}` }, el("span", { class: "actions-word" }, "Actions"), el("span", { class: "actions-dots" }, "⋯"));
   const menu = dropDown(opener, list, "actions-menu");
@@ -48,10 +46,8 @@ export function actionMenu(name: string, items: () => Item[], onProblem: (proble
     try {
       await act();
     } catch (error) {
-      const problem = asProblem(error);
-      onProblem(problem);
       menu.open = true;
-      fill(problemNotice(problem));
+      fill(problemNotice(asProblem(error)));
     }
   };
   const fill = (note: HTMLElement | null = null): void => {

@@ -1,6 +1,5 @@
 /** Dialogs of the page: questions before something is lost, and forms. */
 
-import type { Problem } from "../api/requests";
 import { button, el } from "./elements";
 import { asProblem, report } from "./notices";
 import "./dialogs.css";
@@ -46,7 +45,6 @@ export interface SentForm {
   send: string;
   /** What it does; the form shows its failure and stays. */
   act: Act;
-  onProblem: (problem: Problem) => void;
 }
 
 /**
@@ -55,7 +53,7 @@ export interface SentForm {
  * @param leave Leaves it.
  * @param close Closes it after it was sent, or if the page asks for a key, in a dialog of its own.
  */
-export function sentForm({ content, send, act, onProblem }: SentForm, leave: HTMLElement, close: () => void, kind = "primary"): HTMLFormElement {
+export function sentForm({ content, send, act }: SentForm, leave: HTMLElement, close: () => void, kind = "primary"): HTMLFormElement {
   const note = el("div");
   const go = el("button", { type: "submit", class: kind }, send);
   const perform = async (): Promise<void> => {
@@ -68,7 +66,7 @@ export function sentForm({ content, send, act, onProblem }: SentForm, leave: HTM
       afterwards?.();
     } catch (error) {
       if (asProblem(error).status === 401) close();
-      report(note, error, onProblem);
+      report(note, error);
     } finally {
       go.removeAttribute("aria-disabled");
     }

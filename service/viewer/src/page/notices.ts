@@ -30,11 +30,9 @@ export function asProblem(error: unknown): Problem {
   return new Problem(0, "The page failed", error instanceof Error ? error.message : String(error), "Reload the page.");
 }
 
-/** Show what was thrown, and pass it on; `again` tries once more what failed. */
-export function report(place: HTMLElement, error: unknown, onProblem: (problem: Problem) => void, again?: () => void): void {
-  const problem = asProblem(error);
-  place.replaceChildren(problemNotice(problem, again));
-  onProblem(problem);
+/** Show what was thrown; `again` tries once more what failed. */
+export function report(place: HTMLElement, error: unknown, again?: () => void): void {
+  place.replaceChildren(problemNotice(asProblem(error), again));
 }
 
 /** Announces a text to screen readers. */

@@ -4,7 +4,7 @@ import { el, refill } from "./elements";
 import { announce } from "./notices";
 import { offsetOf, pager } from "./paging";
 import { nothing, table, type Column } from "./tables";
-import type { Hooks, View } from "./view";
+import type { View } from "./view";
 import { Watching } from "./watching";
 
 /** Entries of a page. */
@@ -41,11 +41,8 @@ export abstract class WatchedList<T> extends Watching implements View {
   protected abstract readonly columns: readonly Column<T>[];
   private shown = "";
 
-  constructor(
-    hooks: Hooks,
-    private readonly kind: ListKind,
-  ) {
-    super(hooks, kind.refreshMs);
+  constructor(private readonly kind: ListKind) {
+    super(kind.refreshMs);
   }
 
   follow({ query }: Address): void {

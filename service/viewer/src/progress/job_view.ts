@@ -7,7 +7,7 @@ import { failureRemedy, hasModels, titleOf } from "../jobs/job_words";
 import type { Place } from "../page/address";
 import { button, el } from "../page/elements";
 import { announce, asProblem, problemNotice, report, warningNotice } from "../page/notices";
-import type { Hooks } from "../page/view";
+import { jobsChanged, type View } from "../page/view";
 import { count, duration } from "../words/numbers";
 import { BuildingsSoFar } from "./so_far";
 import { stageNamed, stagesOf, type Stage } from "./stages";
@@ -16,8 +16,8 @@ import "./job_view.css";
 /** Stages in which a job has some of its buildings. */
 const HAS_MODELS = new Set(["reconstruct", "publish", "formats", "outputs"]);
 
-/** Show a job: its progress, its failure or its results. Returns a function that ends the view. */
-export function showJob(place: HTMLElement, named: Place, hooks: Hooks): () => void {
+/** Show a job: its progress, its failure or its results, which follow the address by themselves. */
+export function showJob(place: HTMLElement, named: Place): View {
   const calledOff = new AbortController();
   let leaveResults: () => void = () => undefined;
   const path = pathOfJob(named.job);
@@ -27,20 +27,20 @@ export function showJob(place: HTMLElement, named: Place, hooks: Hooks): () => v
     if (calledOff.signal.aborted) return;
     document.title = `${titleOf(job)} · gablework`;
     if (job.status === "successful" && !hasModels(job)) {
-      place.replaceChildren(await files(job, path, hooks, calledOff.signal));
+      place.replaceChildren(await files(job, path, calledOff.signal));
     } else if (job.status === "successful") {
       // the 3D library is loaded only if there is something to draw
       const { showResults } = await import("../results/results_view");
       if (calledOff.signal.aborted) return;
-      leaveResults = showResults(place, job, named, hooks);
+      leaveResults = showResults(place, job, named);
     } else if (isOver(job.status)) {
-      place.replaceChildren(ended(job, hooks));
+      place.replaceChildren(ended(job));
     } else {
       const soFar = job.processID === "reconstruct" ? new BuildingsSoFar(path, calledOff.signal) : null;
-      const progress = new ProgressView(job, soFar, hooks);
+      const progress = new ProgressView(job, soFar);
       place.replaceChildren(progress.element);
       await progress.follow(path, calledOff.signal);
-      hooks.onChange();
+      jobsChanged();
       await look();
     }
   };
@@ -56,24 +56,25 @@ export function showJob(place: HTMLElement, named: Place, hooks: Hooks): () => v
       }
       const card = el("div", { class: "card" });
       place.replaceChildren(card);
-      report(card, error, hooks.onProblem, begin);
+      report(card, error, begin);
     });
   };
   begin();
-  return () => {
+  const leave = (): void => {
     calledOff.abort();
     leaveResults();
   };
+  return { follow: () => undefined, leave };
 }
 
 /** A job whose results are files without buildings. */
-async function files(job: StatusInfo, path: string, hooks: Hooks, signal: AbortSignal): Promise<HTMLElement> {
+async function files(job: StatusInfo, path: string, signal: AbortSignal): Promise<HTMLElement> {
   const list = await downloadList(path, null, signal);
-  return el("div", { class: "card" }, heading(job, hooks), el("p", {}, job.message ?? ""), list);
+  return el("div", { class: "card" }, heading(job), el("p", {}, job.message ?? ""), list);
 }
 
 /** A job that is over without results. */
-function ended(job: StatusInfo, hooks: Hooks): HTMLElement {
+function ended(job: StatusInfo): HTMLElement {
   const failure = job.exception;
   const notice =
     job.status === "failed"
@@ -82,14 +83,14 @@ function ended(job: StatusInfo, hooks: Hooks): HTMLElement {
   const note = el("div");
   const again = (): void => {
     note.replaceChildren();
-    retry(job, hooks).catch((error: unknown) => report(note, error, hooks.onProblem));
+    retry(job).catch((error: unknown) => report(note, error));
   };
   const actions = el("div", { class: "actions" }, button("Try again…", again, { class: "primary" }));
-  return el("div", { class: "card" }, heading(job, hooks), notice, note, actions);
+  return el("div", { class: "card" }, heading(job), notice, note, actions);
 }
 
-function heading(job: StatusInfo, hooks: Hooks, id?: string): HTMLElement {
-  return el("div", { class: "job-head" }, el("h1", { id }, titleOf(job)), jobMenu(job, hooks));
+function heading(job: StatusInfo, id?: string): HTMLElement {
+  return el("div", { class: "job-head" }, el("h1", { id }, titleOf(job)), jobMenu(job));
 }
 
 /** A job that the service does not have: its address is old. */
@@ -119,7 +120,6 @@ class ProgressView {
   constructor(
     job: StatusInfo,
     private readonly soFar: BuildingsSoFar | null,
-    hooks: Hooks,
   ) {
     this.started = Date.parse(job.started ?? job.created ?? new Date().toISOString());
     for (const stage of stagesOf(job)) this.addStage(stage);
@@ -127,15 +127,15 @@ class ProgressView {
       // a second request would remove the job that the first has stopped
       if (stop.getAttribute("aria-disabled") === "true") return;
       stop.setAttribute("aria-disabled", "true"); // not `disabled`: it keeps the focus
-      cancellation(job, hooks)
-        .catch((error: unknown) => report(this.waiting, error, hooks.onProblem))
+      cancellation(job)
+        .catch((error: unknown) => report(this.waiting, error))
         .finally(() => stop.removeAttribute("aria-disabled"));
     };
     const stop = button("Cancel the job", cancel, { class: "quiet" });
     this.element = el(
       "section",
       { class: "card progress", "aria-labelledby": "progress-title" },
-      heading(job, hooks, "progress-title"),
+      heading(job, "progress-title"),
       el("div", { class: "progress-line" }, this.bar, this.percent),
       el("div", { class: "progress-words" }, this.message, this.elapsed),
       this.waiting,

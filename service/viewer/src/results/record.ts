@@ -1,6 +1,6 @@
 /** The record of one object, beside the models. */
 
-import { getJson, ofRun, type Problem } from "../api/requests";
+import { getJson, ofRun } from "../api/requests";
 import type { Feature } from "../api/types";
 import { dossierLink, followDossier } from "../dossier/dossier_link";
 import { downloadLink } from "../jobs/downloads";
@@ -27,7 +27,7 @@ export interface Named {
 }
 
 /** Show the record of one building; returns a function that stops the loading. */
-export function showRecord(place: HTMLElement, named: Named, onProblem: (problem: Problem) => void): () => void {
+export function showRecord(place: HTMLElement, named: Named): () => void {
   const calledOff = new AbortController();
   const { signal } = calledOff;
   const { jobPath, method, id } = named;
@@ -39,7 +39,7 @@ export function showRecord(place: HTMLElement, named: Named, onProblem: (problem
         if (!signal.aborted) place.replaceChildren(...record(properties, named));
       },
       (error: unknown) => {
-        if (!signal.aborted) report(place, error, onProblem, load);
+        if (!signal.aborted) report(place, error, load);
       },
     );
   };

@@ -15,7 +15,6 @@ import { elevationUnitM } from "../models/units";
 import { addressOf, placeOf, queryOf, type Place } from "../page/address";
 import { button, el, setPressed } from "../page/elements";
 import { announce, asProblem, report, warningNotice } from "../page/notices";
-import type { Hooks } from "../page/view";
 import { ModelScene } from "../scene/scene";
 import { ViewTools } from "../tools/view_tools";
 import { counted } from "../words/numbers";
@@ -29,8 +28,8 @@ import { rejectedRecord, showRecord } from "./record";
 import { nothingFound, resultFacts } from "./result_facts";
 
 /** Show the results of a job: models, list, records and downloads. Returns a function that ends the view. */
-export function showResults(place: HTMLElement, job: StatusInfo, named: Place, hooks: Hooks): () => void {
-  const view = new ResultsView(place, job, named.method, hooks);
+export function showResults(place: HTMLElement, job: StatusInfo, named: Place): () => void {
+  const view = new ResultsView(place, job, named.method);
   view.start().catch((error: unknown) => view.fail(error));
   return () => view.leave();
 }
@@ -80,7 +79,6 @@ class ResultsView {
     place: HTMLElement,
     private readonly job: StatusInfo,
     private readonly named: string | null,
-    private readonly hooks: Hooks,
   ) {
     this.methods = Object.keys(job.summary?.runs ?? {});
     this.method = named ?? this.methods[0] ?? null;
@@ -129,7 +127,7 @@ class ResultsView {
     if (this.calledOff.signal.aborted) return;
     this.wanted = wantedOf(new URLSearchParams(queryOf(location.hash)));
     this.apply();
-    this.downloads.replaceChildren(...this.comparison(), menu, jobMenu(this.job, this.hooks));
+    this.downloads.replaceChildren(...this.comparison(), menu, jobMenu(this.job));
     this.facts.replaceChildren(...resultFacts(this.objects));
     try {
       this.scene = new ModelScene(this.canvas, (id) => this.open(id));
@@ -159,7 +157,7 @@ class ResultsView {
       this.note.replaceChildren();
       again?.();
     };
-    report(this.note, error, this.hooks.onProblem, again && retry);
+    report(this.note, error, again && retry);
   }
 
   leave(): void {
@@ -403,7 +401,7 @@ class ResultsView {
     this.panel.showRecord(id, !fly, before === null, (body) => {
       const object = this.objects.rejected.get(id);
       const named = { jobPath: this.jobPath, method: this.method, id, elevationUnitM: elevationUnitM(this.objects.report.crs) };
-      if (object === undefined) return showRecord(body, named, this.hooks.onProblem);
+      if (object === undefined) return showRecord(body, named);
       body.replaceChildren(...rejectedRecord(object));
       return () => undefined;
     });

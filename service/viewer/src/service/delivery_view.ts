@@ -7,7 +7,7 @@ import { button, el } from "../page/elements";
 import { announce, report } from "../page/notices";
 import { backLink, rawText } from "../page/sheet";
 import { chip, facts, table, type Column } from "../page/tables";
-import type { Hooks, View } from "../page/view";
+import type { View } from "../page/view";
 import { Watching } from "../page/watching";
 import { count, counted } from "../words/numbers";
 
@@ -56,8 +56,8 @@ export function bodyText(body: string): string {
   }
 }
 
-export function showDelivery(place: HTMLElement, id: string, hooks: Hooks): View {
-  const view = new DeliveryView(place, hooks, id);
+export function showDelivery(place: HTMLElement, id: string): View {
+  const view = new DeliveryView(place, id);
   view.follow();
   return view;
 }
@@ -69,8 +69,8 @@ class DeliveryView extends Watching implements View {
   /** Says why it was not sent again. */
   private readonly refusal = el("div");
 
-  constructor(place: HTMLElement, hooks: Hooks, id: string) {
-    super(hooks, REFRESH_MS);
+  constructor(place: HTMLElement, id: string) {
+    super(REFRESH_MS);
     this.path = `webhooks/deliveries/${encodeURIComponent(id)}`;
     document.title = "Message · gablework";
     place.replaceChildren(this.sheet);
@@ -101,7 +101,7 @@ class DeliveryView extends Watching implements View {
     try {
       await request(`${this.path}/replay`, { method: "POST" });
     } catch (error) {
-      report(this.refusal, error, this.hooks.onProblem);
+      report(this.refusal, error);
       return;
     }
     announce("The message is sent again.");

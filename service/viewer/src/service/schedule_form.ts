@@ -9,7 +9,7 @@ import { el } from "../page/elements";
 import { choice, field } from "../page/form_fields";
 import { announce, report } from "../page/notices";
 import { backLink, sheet } from "../page/sheet";
-import type { Hooks, View } from "../page/view";
+import type { View } from "../page/view";
 import { tileLines, USUAL, withTiles } from "./schedules";
 
 const OFFERED = 50;
@@ -69,7 +69,7 @@ export class TimeFields {
 }
 
 /** A new schedule, from the request of a job. */
-export function showNewSchedule(place: HTMLElement, { query }: Address, { onProblem }: Hooks): View {
+export function showNewSchedule(place: HTMLElement, { query }: Address): View {
   const calledOff = new AbortController();
   const { signal } = calledOff;
   const note = el("div");
@@ -83,7 +83,7 @@ export function showNewSchedule(place: HTMLElement, { query }: Address, { onProb
   const times = new TimeFields({});
   let chosen: StatusInfo | null = null;
   const fail = (error: unknown): void => {
-    if (!signal.aborted) report(note, error, onProblem);
+    if (!signal.aborted) report(note, error);
   };
   const choose = async (id: string): Promise<void> => {
     chosen = null;
@@ -122,7 +122,7 @@ export function showNewSchedule(place: HTMLElement, { query }: Address, { onProb
   };
   const hint = "Its method and settings are those of each run. Try them once before you repeat them.";
   const form = sentForm(
-    { content: [field("Repeat this job", jobs, hint), files, ...times.elements, note], send: "Make the schedule", act, onProblem },
+    { content: [field("Repeat this job", jobs, hint), files, ...times.elements, note], send: "Make the schedule", act },
     el("a", { class: "button quiet", href: "#/schedules" }, "Cancel"),
     () => undefined,
   );

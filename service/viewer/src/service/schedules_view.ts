@@ -11,7 +11,7 @@ import { announce } from "../page/notices";
 import { offsetOf, pager } from "../page/paging";
 import { backLink, rawText, section, sheet } from "../page/sheet";
 import { chip, facts, nothing, sub, table, type Column } from "../page/tables";
-import type { Hooks, View } from "../page/view";
+import { jobsChanged, type View } from "../page/view";
 import { hasNext, SIZE, WatchedList, type Answer } from "../page/watched_list";
 import { Watching } from "../page/watching";
 import { ago } from "../words/numbers";
@@ -20,23 +20,22 @@ import { clockWords, countWords, OUTCOME_WORDS, slotWords, tileLines } from "./s
 
 const REFRESH_MS = 10_000;
 
-export function showSchedules(place: HTMLElement, address: Address, hooks: Hooks): View {
+export function showSchedules(place: HTMLElement, address: Address): View {
   const [id] = address.rest;
-  if (id === "new") return showNewSchedule(place, address, hooks);
-  const view = id === undefined ? new ScheduleList(place, hooks) : new ScheduleView(place, hooks, id);
+  if (id === "new") return showNewSchedule(place, address);
+  const view = id === undefined ? new ScheduleList(place) : new ScheduleView(place, id);
   view.follow(address);
   return view;
 }
 
 /** A menu of all that can be done with a schedule. */
-function scheduleMenu(one: Schedule, hooks: Hooks, changed: () => Promise<void>, removed: () => void): HTMLElement {
+function scheduleMenu(one: Schedule, changed: () => Promise<void>, removed: () => void): HTMLElement {
   const path = pathOf(one.scheduleID);
-  const { onProblem } = hooks;
   const runNow = async (): Promise<void> => {
     const response = await request(`${path}/run`, { method: "POST" });
     const { jobID } = (await response.json()) as StatusInfo;
     announce("The job is submitted.");
-    hooks.onChange();
+    jobsChanged();
     location.hash = hashOf(["jobs", jobID]);
   };
   const change = async (changes: Record<string, unknown>, words: string): Promise<void> => {
@@ -51,7 +50,6 @@ function scheduleMenu(one: Schedule, hooks: Hooks, changed: () => Promise<void>,
       content: times.elements,
       send: "Save",
       act: () => change(times.value(), "The schedule is changed."),
-      onProblem,
     });
   };
   const remove = (): void =>
@@ -62,7 +60,6 @@ function scheduleMenu(one: Schedule, hooks: Hooks, changed: () => Promise<void>,
         announce("The schedule is removed.");
         removed();
       },
-      onProblem,
     });
   const paused = one.state === "paused";
   const items: Item[] = [
@@ -72,7 +69,7 @@ function scheduleMenu(one: Schedule, hooks: Hooks, changed: () => Promise<void>,
     { label: "Its jobs", href: hashOf(["jobs"], { scheduleID: one.scheduleID }) },
     { label: "Remove…", act: remove },
   ];
-  return actionMenu(nameOf(one), () => items, onProblem);
+  return actionMenu(nameOf(one), () => items);
 }
 
 class ScheduleList extends WatchedList<Schedule> {
@@ -88,12 +85,12 @@ class ScheduleList extends WatchedList<Schedule> {
     { head: "State", cell: ({ state }) => chip(state) },
     { head: "Next time", kind: "only-wide", cell: nextWords },
     { head: "Last time", kind: "only-wide", cell: ({ lastRun }) => (lastRun === undefined ? "–" : [outcomeChip(lastRun), ` ${ago(lastRun.at)}`]) },
-    { head: "Actions", kind: "acts", cell: (one) => scheduleMenu(one, this.hooks, () => this.load(), () => void this.load()) },
+    { head: "Actions", kind: "acts", cell: (one) => scheduleMenu(one, () => this.load(), () => void this.load()) },
   ];
 
-  constructor(place: HTMLElement, hooks: Hooks) {
+  constructor(place: HTMLElement) {
     const words = ["schedules"];
-    super(hooks, { name: "Schedules", path: "schedules", member: "schedules", words, filters: [], refreshMs: REFRESH_MS });
+    super({ name: "Schedules", path: "schedules", member: "schedules", words, filters: [], refreshMs: REFRESH_MS });
     const make = el("a", { class: "button", href: "#/schedules/new" }, "New schedule…");
     const hint = el("p", { class: "hint" }, "Jobs that the service repeats by itself at fixed times.");
     place.replaceChildren(sheet("Schedules", [make], hint, this.note, this.frame, this.pages));
@@ -115,10 +112,9 @@ class ScheduleView extends Watching implements View {
 
   constructor(
     place: HTMLElement,
-    hooks: Hooks,
     private readonly id: string,
   ) {
-    super(hooks, REFRESH_MS);
+    super(REFRESH_MS);
     document.title = "Schedule · gablework";
     place.replaceChildren(el("div", { class: "sheet" }, this.content, this.note));
   }
@@ -157,7 +153,7 @@ class ScheduleView extends Watching implements View {
     };
     document.title = `${nameOf(one)} · gablework`;
     return [
-      el("div", { class: "sheet-head" }, el("h1", {}, nameOf(one)), scheduleMenu(one, this.hooks, () => this.load(), leave)),
+      el("div", { class: "sheet-head" }, el("h1", {}, nameOf(one)), scheduleMenu(one, () => this.load(), leave)),
       back(),
       facts(
         { class: "facts-list" },

@@ -10,7 +10,7 @@ import { Boxes, choice, field, searchForm } from "../page/form_fields";
 import { announce, asProblem, report } from "../page/notices";
 import { section, sheet } from "../page/sheet";
 import { chip, nothing, sub, table, type Column } from "../page/tables";
-import type { Hooks, View } from "../page/view";
+import type { View } from "../page/view";
 import { WatchedList } from "../page/watched_list";
 import { Watching } from "../page/watching";
 import { ago } from "../words/numbers";
@@ -18,10 +18,10 @@ import { deliveryChip, DELIVERY_WORDS, receiverState, showDelivery, unsentWords 
 
 const REFRESH_MS = 4000;
 
-export function showWebhooks(place: HTMLElement, address: Address, hooks: Hooks): View {
+export function showWebhooks(place: HTMLElement, address: Address): View {
   const [part, id] = address.rest;
-  if (part === "deliveries" && id !== undefined) return showDelivery(place, id, hooks);
-  const view = new Webhooks(place, hooks);
+  if (part === "deliveries" && id !== undefined) return showDelivery(place, id);
+  const view = new Webhooks(place);
   view.follow(address);
   return view;
 }
@@ -51,12 +51,12 @@ class Webhooks extends Watching implements View {
         return [chip(state === "enabled" ? "good" : "warn", state), sub(unsentWords(one)), sub(one.disabledReason)];
       },
     },
-    { head: "Actions", kind: "acts", cell: (one) => actionMenu(nameOf(one), () => this.items(one), this.hooks.onProblem) },
+    { head: "Actions", kind: "acts", cell: (one) => actionMenu(nameOf(one), () => this.items(one)) },
   ];
 
-  constructor(place: HTMLElement, hooks: Hooks) {
-    super(hooks, 0);
-    this.log = new Log(hooks, (id) => this.webhooks.find(({ webhookID }) => webhookID === id)?.description ?? null);
+  constructor(place: HTMLElement) {
+    super(0);
+    this.log = new Log((id) => this.webhooks.find(({ webhookID }) => webhookID === id)?.description ?? null);
     place.replaceChildren(
       sheet(
         "Webhooks",
@@ -70,7 +70,7 @@ class Webhooks extends Watching implements View {
           this.receivers,
         ),
         this.log.element,
-        ownSecret(hooks),
+        ownSecret(),
       ),
     );
     void this.load();
@@ -118,7 +118,6 @@ class Webhooks extends Watching implements View {
       ask("Remove the webhook?", `${url} gets nothing more. Messages that wait are dropped; the log stays.`, {
         send: "Remove it",
         act: () => this.changed(path, "DELETE", "It is removed."),
-        onProblem: this.hooks.onProblem,
       });
     return [
       { label: "Send what it missed", act: () => this.changed(`${path}/replay`, "POST", "What it missed is sent.") },
@@ -153,17 +152,16 @@ class Webhooks extends Watching implements View {
         await this.load();
         return () => showSecret(made);
       },
-      onProblem: this.hooks.onProblem,
     });
   }
 }
 
 /** The secret of the key. */
-function ownSecret({ onProblem }: Hooks): HTMLElement {
+function ownSecret(): HTMLElement {
   const note = el("div");
   const show = (): void => {
     note.replaceChildren();
-    getJson<Secret>("webhooks/secret").then(showSecret, (error: unknown) => report(note, error, onProblem));
+    getJson<Secret>("webhooks/secret").then(showSecret, (error: unknown) => report(note, error));
   };
   const replace = (): void =>
     ask("Replace the secret of this key?", "The old secret signs no longer. Give the new one to the receivers at once.", {
@@ -172,7 +170,6 @@ function ownSecret({ onProblem }: Hooks): HTMLElement {
         const secret = (await (await request("webhooks/secret/rotate", { method: "POST" })).json()) as Secret;
         return () => showSecret(secret);
       },
-      onProblem,
     });
   return section(
     "secret-title",
@@ -234,12 +231,9 @@ class Log extends WatchedList<Delivery> {
   private readonly receiver = choice("log-receiver", { "": "any" });
   private readonly job = el("input", { type: "text", id: "log-job", autocomplete: "off", spellcheck: "false" });
 
-  constructor(
-    hooks: Hooks,
-    private readonly nameOf: (webhook: string) => string | null,
-  ) {
+  constructor(private readonly nameOf: (webhook: string) => string | null) {
     const filters = ["job", "state", "webhook"];
-    super(hooks, { name: "Messages", path: "webhooks/deliveries", member: "deliveries", words: ["webhooks"], filters, refreshMs: REFRESH_MS });
+    super({ name: "Messages", path: "webhooks/deliveries", member: "deliveries", words: ["webhooks"], filters, refreshMs: REFRESH_MS });
     const search = (): void => {
       location.hash = hashOf(["webhooks"], { job: this.job.value.trim(), state: this.state.value, webhook: this.receiver.value });
     };
