@@ -2,10 +2,12 @@
 
 import { getJson, ofRun, orNull, request, runReport } from "../api/requests";
 import type { Decision, Feature } from "../api/types";
+import { Batcher, type Batch } from "../models/batching";
 import type { SceneFrame } from "../models/building_mesh";
 import { SequenceReader, type Building } from "../models/cityjson";
 import { CYCLE } from "../models/colouring";
 import { COLUMNS, shown } from "../models/columns";
+import { flatOutlines } from "../models/failed_footprints";
 import { ringsOf } from "../models/plan";
 import { elevationUnitM, inMetres, modelUnits } from "../models/units";
 import { el, svg } from "../page/elements";
@@ -24,6 +26,8 @@ interface Loaded {
   properties: Feature["properties"];
   outline: Rings;
   building: Building;
+  /** Its model, or its outline if it has none, to be drawn in 3D. */
+  batches: Batch[];
   frame: SceneFrame;
   crs: string;
   /** Null where the service recorded none. */
@@ -103,11 +107,19 @@ async function load(jobPath: string, method: string | null, buildingId: string, 
     properties: feature.properties,
     outline,
     building,
+    batches: batchesOf(feature, building, frame),
     frame,
     crs: report?.crs?.name ?? "CRS unknown",
     decisions: decisions?.decisions ?? null,
     points: points === null ? null : pointsIn(points, frame),
   };
+}
+
+function batchesOf(feature: Feature, building: Building, frame: SceneFrame): Batch[] {
+  if (building.faces.length === 0) return flatOutlines([feature], "failed", frame, () => 0).batches;
+  const batcher = new Batcher(frame);
+  batcher.add(building);
+  return batcher.take();
 }
 
 /** The points of a building; null for one whose process ended before they were assigned to it. */
@@ -139,8 +151,8 @@ function draw(body: HTMLElement, loaded: Loaded): () => void {
     role: "img",
     "aria-label": "The model and its points in 3D. Arrow keys turn, plus and minus zoom.",
   });
-  const hasModel = building.faces.length > 0;
-  const space = hasModel || points !== null ? figure("In 3D", "Drag to turn, the wheel zooms.", canvas) : null;
+  const stage = el("div", { class: "dossier-drawing dossier-space stage3d" }, canvas);
+  const space = loaded.batches.length > 0 ? figure("In 3D", "Drag to turn, the wheel zooms.", stage) : null;
   const inStrip = points === null || section === null ? 0 : strip(points, section, halfWidthM).length;
   const stripWords = points === null ? "" : ` ${counted(inStrip, "point")} within ${measure(halfWidthM, 1, "m")} of the line.`;
   body.replaceChildren(
@@ -167,12 +179,12 @@ function draw(body: HTMLElement, loaded: Loaded): () => void {
       ({ DossierScene }) => {
         if (over) return;
         try {
-          scene = new DossierScene(canvas, building, frame, points, colouringOf(body));
+          scene = new DossierScene(canvas, loaded.batches, points, colouringOf(body));
         } catch {
-          canvas.replaceWith(el("p", { class: "hint" }, "This browser cannot draw in 3D."));
+          stage.replaceWith(el("p", { class: "hint" }, "This browser cannot draw in 3D."));
         }
       },
-      () => canvas.replaceWith(el("p", { class: "hint" }, "The 3D view could not be loaded.")),
+      () => stage.replaceWith(el("p", { class: "hint" }, "The 3D view could not be loaded.")),
     );
   }
   return () => {

@@ -36,14 +36,16 @@ export class ModelScene {
 
   /**
    * @param canvas Fills its parent.
-   * @param onPick Gets the building that was clicked, null for a click beside all of them.
+   * @param onPick Gets the building that was clicked, null for a click beside all of them; without it the view is a
+   *   picture, which may be printed.
    * @throws Error if the browser has no WebGL.
    */
   constructor(
     private readonly canvas: HTMLCanvasElement,
-    onPick: (id: string | null) => void,
+    onPick: ((id: string | null) => void) | null,
   ) {
-    this.renderer = new WebGLRenderer({ canvas, antialias: true, powerPreference: "high-performance" });
+    const isPicture = onPick === null; // kept after drawing, so that it can be printed
+    this.renderer = new WebGLRenderer({ canvas, antialias: true, powerPreference: "high-performance", preserveDrawingBuffer: isPicture });
     this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
     this.renderer.shadowMap.enabled = true;
     this.renderer.shadowMap.type = PCFShadowMap;
@@ -63,9 +65,9 @@ export class ModelScene {
       "-": () => navigation.zoom(0.8),
       f: () => this.fit(),
       t: () => this.top(),
-      Escape: () => onPick(null),
+      ...(onPick === null ? {} : { Escape: () => onPick(null) }),
     };
-    this.pointing = new Pointing(canvas, this, onPick, keys, this.request);
+    this.pointing = new Pointing(canvas, this, onPick ?? (() => undefined), keys, this.request);
     this.watch = new ResizeObserver(() => this.resize());
     this.watch.observe(canvas.parentElement ?? canvas);
     this.resize();
@@ -220,6 +222,7 @@ export class ModelScene {
     this.renderer.render(this.scene, camera.view);
     const { render } = this.renderer.info;
     Object.assign(this.canvas.dataset, {
+      drawn: true,
       models: models.count,
       triangles: render.triangles,
       calls: render.calls,
