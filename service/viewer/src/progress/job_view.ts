@@ -114,7 +114,9 @@ class ProgressView {
   private readonly elapsed = el("span", { class: "elapsed" });
   private readonly stages = el("ol", { class: "stages" });
   private readonly shown: string[] = [];
-  private rows = new Map<string, { row: HTMLElement; figure: HTMLElement }>();
+  private known: Stage[];
+  /** How far each stage is. */
+  private readonly figures = new Map<string, string>();
   private readonly started: number;
 
   constructor(
@@ -122,7 +124,7 @@ class ProgressView {
     private readonly soFar: BuildingsSoFar | null,
   ) {
     this.started = Date.parse(job.started ?? job.created ?? new Date().toISOString());
-    for (const stage of stagesOf(job)) this.addStage(stage);
+    this.known = stagesOf(job);
     const cancel = (): void => {
       // a second request would remove the job that the first has stopped
       if (stop.getAttribute("aria-disabled") === "true") return;
@@ -145,6 +147,7 @@ class ProgressView {
       el("div", { class: "actions" }, stop),
     );
     this.set(job.progress ?? 0, job.message ?? "");
+    this.drawStages("");
     if (job.stage !== undefined) this.enter(job.stage);
   }
 
@@ -192,27 +195,21 @@ class ProgressView {
 
   private enter(stage: string, event?: JobEvent): void {
     if (HAS_MODELS.has(stage)) this.soFar?.begin();
-    if (!this.rows.has(stage)) this.addStage(stageNamed(stage), stage === "compile");
-    let before = true;
-    for (const [name, { row, figure }] of this.rows) {
-      if (name === stage) {
-        before = false;
-        row.className = "stage stage-now";
-        row.setAttribute("aria-current", "step");
-        if (event !== undefined && event.total > 1) figure.textContent = `${count(event.done)} of ${count(event.total)} ${stageNamed(name).unit}`;
-      } else {
-        row.className = before ? "stage stage-done" : "stage";
-        row.removeAttribute("aria-current");
-      }
-    }
+    const one = stageNamed(stage);
+    // what is compiled comes before all else
+    if (!this.known.some(({ name }) => name === stage)) this.known = stage === "compile" ? [one, ...this.known] : [...this.known, one];
+    if (event !== undefined && event.total > 1) this.figures.set(stage, `${count(event.done)} of ${count(event.total)} ${one.unit}`);
+    this.drawStages(stage);
   }
 
-  private addStage({ name, words }: Stage, isFirst = false): void {
-    const figure = el("span", { class: "stage-figure" });
-    const row = el("li", { class: "stage" }, el("span", { class: "stage-name" }, words), figure);
-    const one = [name, { row, figure }] as const;
-    this.rows = new Map(isFirst ? [one, ...this.rows] : [...this.rows, one]); // in the order of the stages
-    this.stages.replaceChildren(...[...this.rows.values()].map((known) => known.row));
+  private drawStages(stage: string): void {
+    const now = this.known.findIndex(({ name }) => name === stage);
+    const rows = this.known.map(({ name, words }, i) => {
+      const kind = i === now ? "stage stage-now" : i < now ? "stage stage-done" : "stage";
+      const parts = [el("span", { class: "stage-name" }, words), el("span", { class: "stage-figure" }, this.figures.get(name))];
+      return el("li", { class: kind, "aria-current": i === now ? "step" : null }, ...parts);
+    });
+    this.stages.replaceChildren(...rows);
   }
 
   private tick(): void {
