@@ -7,6 +7,7 @@ import type { Batch, Listed } from "../models/batching";
 import { originInMetres } from "../models/building_mesh";
 import { CHANGES, LIMITS, pairs, type Change, type Pair, type Placed } from "../models/pairing";
 import { RunObjects } from "../models/run_objects";
+import { countOf } from "../models/selection";
 import { hashOf, partsOf, type Address } from "../page/address";
 import { button, colourSwatch, el, type Properties } from "../page/elements";
 import { choice, field } from "../page/form_fields";
@@ -242,8 +243,7 @@ class Changes implements View {
   // --- the list
 
   private fill(): void {
-    const counts = new Map<Change, number>();
-    for (const { change } of this.found) counts.set(change, (counts.get(change) ?? 0) + 1);
+    const counts = countOf(this.found.map(({ change }) => change));
     this.legend.hidden = this.explanation.hidden = false;
     this.legend.replaceChildren(
       ...(Object.keys(CHANGES) as Change[]).filter((change) => counts.has(change)).map((change) => {

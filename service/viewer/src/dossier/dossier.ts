@@ -10,8 +10,8 @@ import { COLUMNS, shown } from "../models/columns";
 import { flatOutlines } from "../models/failed_footprints";
 import { ringsOf } from "../models/plan";
 import { elevationUnitM, inMetres, modelUnits } from "../models/units";
-import { el, svg } from "../page/elements";
-import { asProblem, problemNotice } from "../page/notices";
+import { button, el, svg } from "../page/elements";
+import { report } from "../page/notices";
 import { RESIDUALS } from "../points/points_colouring";
 import { capital } from "../words/fields";
 import { count, counted, measure } from "../words/numbers";
@@ -19,7 +19,8 @@ import { CATEGORIES, categoryOf } from "../words/roof_types";
 import { histogramDrawing, planDrawing, planeColour, sectionDrawing, type Colouring, type Rings } from "./dossier_drawings";
 import { histogram, modelOf, roofEdges, sectionOf, strip, stripWidth, type Points } from "./dossier_geometry";
 import { pointsIn } from "./dossier_points";
-import { checkRows, formRows, LEAD, trust, trustFigures, withinWords } from "./dossier_words";
+import type { DossierScene } from "./dossier_scene";
+import { checkRows, formRows, trust, trustFigures, withinWords } from "./dossier_words";
 import "./dossier.css";
 
 interface Loaded {
@@ -48,12 +49,19 @@ export function openDossier(jobPath: string, method: string | null, buildingId: 
       el("h1", { id: "dossier-title" }, "Dossier"),
       el("code", {}, buildingId),
       el("span", { class: "spacer" }),
-      el("button", { type: "button", class: "quiet", onclick: () => window.print() }, "Print"),
-      el("button", { type: "button", class: "quiet", autofocus: true, onclick: () => dialog.close() }, "Close"),
+      button("Print", () => window.print(), { class: "quiet" }),
+      button("Close", () => dialog.close(), { class: "quiet", autofocus: true }),
     ),
     body,
   );
   let end: () => void = () => undefined;
+  const close = (): void => {
+    if (calledOff.signal.aborted) return;
+    calledOff.abort();
+    end();
+    dialog.remove();
+    document.body.classList.remove("has-dossier");
+  };
   dialog.addEventListener("close", () => {
     close();
     onClose();
@@ -66,16 +74,9 @@ export function openDossier(jobPath: string, method: string | null, buildingId: 
       if (!calledOff.signal.aborted) end = draw(body, loaded);
     },
     (error: unknown) => {
-      if (!calledOff.signal.aborted) body.replaceChildren(problemNotice(asProblem(error)));
+      if (!calledOff.signal.aborted) report(body, error);
     },
   );
-  function close(): void {
-    if (calledOff.signal.aborted) return;
-    calledOff.abort();
-    end();
-    dialog.remove();
-    document.body.classList.remove("has-dossier");
-  }
   return close;
 }
 
@@ -137,7 +138,7 @@ function draw(body: HTMLElement, loaded: Loaded): () => void {
   const plan = el("div", { class: "dossier-drawing" });
   const profile = el("div", { class: "dossier-drawing" });
   const key = el("ul", { class: "dossier-key" });
-  let scene: { colour: (colouring: Colouring) => void; dispose: () => void } | null = null;
+  let scene: DossierScene | null = null;
   let over = false;
   const paint = (colouring: Colouring): void => {
     plan.replaceChildren(planDrawing(outline, edges, section, points, colouring));
@@ -175,17 +176,11 @@ function draw(body: HTMLElement, loaded: Loaded): () => void {
   const first: Colouring = "residual";
   paint(first);
   if (space !== null) {
-    import("./dossier_scene").then(
-      ({ DossierScene }) => {
-        if (over) return;
-        try {
-          scene = new DossierScene(canvas, loaded.batches, points, colouringOf(body));
-        } catch {
-          stage.replaceWith(el("p", { class: "hint" }, "This browser cannot draw in 3D."));
-        }
-      },
-      () => stage.replaceWith(el("p", { class: "hint" }, "The 3D view could not be loaded.")),
-    );
+    import("./dossier_scene")
+      .then((loaded3d) => {
+        if (!over) scene = new loaded3d.DossierScene(canvas, loaded.batches, points, colouringOf(body));
+      })
+      .catch(() => stage.replaceWith(el("p", { class: "hint" }, "This browser cannot draw in 3D, or the view could not be loaded.")));
   }
   return () => {
     over = true;
@@ -287,27 +282,13 @@ function figuresTable(properties: Feature["properties"], decisions: Decision[]):
 }
 
 function formsTable(properties: Feature["properties"], decisions: Decision[] | null): HTMLElement {
-  if (decisions === null) {
-    return el("section", {}, el("h2", {}, "The forms that were tried"), el("p", { class: "hint" }, "This job was made by a version that recorded none."));
+  const caption = "The forms that were tried";
+  const rows = formRows(decisions ?? [], properties);
+  if (rows.length === 0) {
+    const words = decisions === null ? "This job was made by a version that recorded none." : "None was tried.";
+    return el("section", {}, el("h2", {}, caption), el("p", { class: "hint" }, words));
   }
-  type FormRow = ReturnType<typeof formRows>[number];
-  const rows: FormRow[] = formRows(decisions, properties);
-  if (rows.length === 0) return el("section", {}, el("h2", {}, "The forms that were tried"), el("p", { class: "hint" }, "None was tried."));
-  const columns: [string, (row: FormRow) => string][] = [
-    ["Form", (row) => row.form],
-    ["Outcome", (row) => row.outcome],
-    ["Faces", (row) => row.faces],
-    ["Planes", (row) => row.planes],
-    ["Points explained", (row) => row.explained],
-    ["RMSE", (row) => row.rmse],
-    [LEAD, (row) => row.margin],
-    ["Notes", (row) => row.detail],
-  ];
-  const filled = columns.filter(([, show]) => rows.some((row) => !["", "–"].includes(show(row))));
-  return table(
-    "The forms that were tried",
-    filled.map(([head]) => head),
-    rows.map((row) => filled.map(([, show]) => show(row))),
-    (i) => (rows[i].chosen ? "dossier-chosen" : null),
-  );
+  const filled = Object.keys(rows[0].cells).filter((head) => rows.some(({ cells }) => !["", "–"].includes(cells[head])));
+  const cells = rows.map((row) => filled.map((head) => row.cells[head]));
+  return table(caption, filled, cells, (i) => (rows[i].chosen ? "dossier-chosen" : null));
 }

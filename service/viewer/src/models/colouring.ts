@@ -4,6 +4,7 @@ import { Color } from "three";
 import { reasonWords } from "../words/reasons";
 import { CATEGORIES, type Category } from "../words/roof_types";
 import { SURFACE, type Batch, type Listed } from "./batching";
+import { countOf } from "./selection";
 
 /** A colour with its meaning. */
 export interface ColourClass {
@@ -22,8 +23,6 @@ export const COLOURINGS = {
 } as const;
 
 export type Colouring = keyof typeof COLOURINGS;
-
-export const COLOURING_NAMES = Object.keys(COLOURINGS) as Colouring[];
 
 const GREY = "#8d99a6";
 const PLAIN = "#cbc3b6"; // of roofs below coloured points
@@ -71,11 +70,7 @@ export type Counted = ColourClass & { count: number };
 
 /** The classes that the buildings have, with the number of each. */
 export function classesOf(colouring: "residual" | "status" | "reason", buildings: readonly Listed[]): Counted[] {
-  const counts = new Map<ColourClass, number>();
-  for (const building of buildings) {
-    const one = classOf(colouring, building.category, building.reason, building.figures.within ?? null);
-    counts.set(one, (counts.get(one) ?? 0) + 1);
-  }
+  const counts = countOf(buildings.map(({ category, reason, figures }) => classOf(colouring, category, reason, figures.within ?? null)));
   const order: readonly ColourClass[] =
     colouring === "residual" ? RESIDUALS : colouring === "status" ? STATUSES : [NO_REASON, ...REASONS.values(), OTHER_REASON];
   return [...order, LEFT_OUT].flatMap((one) => (counts.has(one) ? [{ ...one, count: counts.get(one) ?? 0 }] : []));
