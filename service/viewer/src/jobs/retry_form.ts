@@ -2,7 +2,7 @@ import { getJson, pathOfJob, sendJson } from "../api/requests";
 import type { InputDescription, StatusInfo } from "../api/types";
 import { openForm } from "../page/dialogs";
 import { el } from "../page/elements";
-import { Boxes, choice } from "../page/form_fields";
+import { Boxes, controlOf, field } from "../page/form_fields";
 import { announce } from "../page/notices";
 import { jobsChanged } from "../page/view";
 import { titleOf } from "./job_words";
@@ -78,12 +78,8 @@ function fieldOf(name: string, { title, description, schema }: InputDescription,
   }
   const text = given ?? schema.default ?? "";
   const shown = Array.isArray(text) ? text.join(", ") : String(text);
-  const control =
-    schema.enum === undefined
-      ? el("input", { type: "text", id, value: shown, autocomplete: "off", "aria-describedby": hint.id })
-      : choice(id, { ...(schema.default == null ? { "": "as in the file" } : {}), ...Object.fromEntries(schema.enum.map((word) => [word, word])) }, shown);
-  control.setAttribute("aria-describedby", hint.id);
-  const element = el("div", { class: "field" }, el("label", { for: id }, label), control, hint);
+  const control = controlOf(schema, id, shown, schema.default == null ? { "": "as in the file" } : {});
+  const element = field(label, control, description ?? "");
   const value = (typed: string): unknown => {
     if (name === "bbox") return typed.split(",").map(Number);
     return schema.type === "number" && Number.isFinite(Number(typed)) ? Number(typed) : typed;

@@ -1,5 +1,6 @@
 /** The outlines in plan, north up, drawn on a canvas. It is independent of the service, of lists and of the 3D view. */
 
+import { MathUtils } from "three";
 import type { Outlines } from "../models/outlines";
 import { boxAround, united, type Box } from "../models/plan";
 import { el, onKeys } from "../page/elements";
@@ -251,9 +252,9 @@ export class OutlineMap {
   private fly(now: number): void {
     if (this.flight === null) return;
     const { from, start, end } = this.flight;
-    const share = Math.min(Math.max((now - from) / FLIGHT_MS, 0), 1);
-    this.view.between(start, end, share * share * (3 - 2 * share));
-    if (share === 1) this.flight = null;
+    const eased = MathUtils.smoothstep(now, from, from + FLIGHT_MS);
+    this.view.between(start, end, eased);
+    if (eased === 1) this.flight = null;
   }
 
   private zoom(factor: number, x = this.view.width / 2, y = this.view.height / 2): void {

@@ -7,8 +7,7 @@ import { button, el } from "../page/elements";
 import { announce, report } from "../page/notices";
 import { backLink, rawText } from "../page/sheet";
 import { chip, facts, table, type Column } from "../page/tables";
-import type { View } from "../page/view";
-import { Watching } from "../page/watching";
+import { WatchedPage } from "../page/watched_page";
 import { count, counted } from "../words/numbers";
 
 const REFRESH_MS = 2000;
@@ -56,44 +55,22 @@ export function bodyText(body: string): string {
   }
 }
 
-export function showDelivery(place: HTMLElement, id: string): View {
-  const view = new DeliveryView(place, id);
-  view.follow();
-  return view;
-}
-
-class DeliveryView extends Watching implements View {
-  private shown = "";
+export class DeliveryView extends WatchedPage<Delivery> {
   private readonly path: string;
-  private readonly sheet = el("div", { class: "sheet" }, el("p", { class: "loading" }, "Loading…"), this.note);
   /** Says why it was not sent again. */
   private readonly refusal = el("div");
 
   constructor(place: HTMLElement, id: string) {
-    super(REFRESH_MS);
+    super(place, "Message", backLink("#/webhooks", "All messages"), REFRESH_MS);
     this.path = `webhooks/deliveries/${encodeURIComponent(id)}`;
-    document.title = "Message · gablework";
-    place.replaceChildren(this.sheet);
   }
 
-  follow(): void {
-    void this.load();
+  protected get(signal: AbortSignal): Promise<Delivery> {
+    return getJson<Delivery>(this.path, { signal });
   }
 
-  protected async read(signal: AbortSignal): Promise<boolean> {
-    try {
-      const found = await getJson<Delivery>(this.path, { signal });
-      const state = JSON.stringify(found);
-      if (!signal.aborted && state !== this.shown) {
-        if (this.shown !== "") announce(`The message is ${DELIVERY_WORDS[found.state] ?? found.state}.`);
-        this.shown = state;
-        this.draw(found);
-      }
-      return found.state === "waiting";
-    } catch (error) {
-      if (!signal.aborted && this.shown === "") this.sheet.replaceChildren(back(), this.note);
-      throw error;
-    }
+  protected mayChange({ state }: Delivery): boolean {
+    return state === "waiting";
   }
 
   private async replay(): Promise<void> {
@@ -108,16 +85,14 @@ class DeliveryView extends Watching implements View {
     await this.load();
   }
 
-  private draw(found: Delivery): void {
-    const { nextAttempt, finished, body } = found;
-    const isFirst = found.state === "waiting" && found.attemptCount === 0;
-    const again = button("Send again", () => void this.replay(), { class: "primary", hidden: isFirst });
-    const hadFocus = this.sheet.contains(document.activeElement) && document.activeElement?.tagName === "BUTTON";
-    const remedy = DELIVERY_REMEDIES[found.state];
-    this.sheet.replaceChildren(
+  protected parts(found: Delivery, isFirst: boolean): [HTMLElement, ...HTMLElement[]] {
+    const { state, nextAttempt, finished, body } = found;
+    if (!isFirst) announce(`The message is ${DELIVERY_WORDS[state] ?? state}.`);
+    const isUnderWay = state === "waiting" && found.attemptCount === 0;
+    const again = button("Send again", () => void this.replay(), { class: "primary", hidden: isUnderWay });
+    const remedy = DELIVERY_REMEDIES[state];
+    return [
       el("div", { class: "sheet-head" }, el("h1", {}, `Message: ${found.title}`), again),
-      back(),
-      this.note,
       this.refusal,
       facts(
         { class: "facts-list" },
@@ -133,8 +108,7 @@ class DeliveryView extends Watching implements View {
       ),
       attempts(found),
       ...(body === undefined ? [] : [rawText("body-title", "Body", bodyText(body))]),
-    );
-    if (hadFocus) again.focus();
+    ];
   }
 }
 
@@ -155,7 +129,5 @@ function attempts({ attempts: made = [] }: Delivery): HTMLElement {
   const none = el("p", { class: "hint" }, "None yet. A driver of the service sends it.");
   return el("section", {}, el("h2", {}, "Attempts"), made.length === 0 ? none : table("Attempts", ATTEMPTS, made));
 }
-
-const back = (): HTMLElement => backLink("#/webhooks", "All messages");
 
 const time = (text: string): string => new Date(text).toLocaleString();

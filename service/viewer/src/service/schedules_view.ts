@@ -13,7 +13,7 @@ import { backLink, rawText, section, sheet } from "../page/sheet";
 import { chip, facts, nothing, sub, table, type Column } from "../page/tables";
 import { jobsChanged, type View } from "../page/view";
 import { hasNext, SIZE, WatchedList, type Answer } from "../page/watched_list";
-import { Watching } from "../page/watching";
+import { WatchedPage } from "../page/watched_page";
 import { ago } from "../words/numbers";
 import { showNewSchedule, TimeFields } from "./schedule_form";
 import { clockWords, countWords, OUTCOME_WORDS, slotWords, tileLines } from "./schedules";
@@ -105,56 +105,46 @@ class ScheduleList extends WatchedList<Schedule> {
   }
 }
 
-class ScheduleView extends Watching implements View {
+type Runs = Answer & { runs: ScheduleRun[] };
+
+class ScheduleView extends WatchedPage<[Schedule, Runs]> {
   private offset = 0;
-  private shown = "";
-  private readonly content = el("div", {}, el("p", { class: "loading" }, "Loading…"));
 
   constructor(
     place: HTMLElement,
     private readonly id: string,
   ) {
-    super(REFRESH_MS);
-    document.title = "Schedule · gablework";
-    place.replaceChildren(el("div", { class: "sheet" }, this.content, this.note));
+    super(place, "Schedule", backLink("#/schedules", "All schedules"), REFRESH_MS);
   }
 
-  follow({ query }: Address): void {
-    this.offset = offsetOf(query.get("offset"));
-    void this.load();
+  override follow(address: Address): void {
+    this.offset = offsetOf(address.query.get("offset"));
+    super.follow(address);
   }
 
-  protected async read(signal: AbortSignal): Promise<boolean> {
+  protected get(signal: AbortSignal): Promise<[Schedule, Runs]> {
     const path = pathOf(this.id);
-    try {
-      const [one, answer] = await Promise.all([
-        getJson<Schedule>(path, { signal }),
-        getJson<Answer & { runs: ScheduleRun[] }>(`${path}/runs?limit=${SIZE}&offset=${this.offset}`, { signal }),
-      ]);
-      const state = JSON.stringify([one, answer.runs]);
-      if (signal.aborted || state === this.shown || this.content.querySelector("details[open]") !== null) return true;
-      this.shown = state;
-      this.content.replaceChildren(...this.parts(one, answer.runs, hasNext(answer)));
-      return true;
-    } catch (error) {
-      if (this.shown === "") this.content.replaceChildren(back());
-      throw error;
-    }
+    const runs = getJson<Runs>(`${path}/runs?limit=${SIZE}&offset=${this.offset}`, { signal });
+    return Promise.all([getJson<Schedule>(path, { signal }), runs]);
   }
 
-  private parts(one: Schedule, runs: ScheduleRun[], isMore: boolean): HTMLElement[] {
+  protected mayChange(): boolean {
+    return true;
+  }
+
+  protected parts([one, answer]: [Schedule, Runs]): [HTMLElement, ...HTMLElement[]] {
     const zone = one.timeZone;
+    const { runs } = answer;
     const inputs = one.execute?.inputs ?? {};
     const files = tileLines(inputs).split("\n").filter((line) => line !== "");
     const next = one.nextTimes.map((time) => el("li", {}, clockWords(time, zone)));
-    const page = { offset: this.offset, size: SIZE, shown: runs.length, total: null, hasNext: isMore };
+    const page = { offset: this.offset, size: SIZE, shown: runs.length, total: null, hasNext: hasNext(answer) };
     const leave = (): void => {
       location.hash = "#/schedules";
     };
     document.title = `${nameOf(one)} · gablework`;
     return [
       el("div", { class: "sheet-head" }, el("h1", {}, nameOf(one)), scheduleMenu(one, () => this.load(), leave)),
-      back(),
       facts(
         { class: "facts-list" },
         ["State", chip(one.state)],
@@ -192,7 +182,5 @@ const pathOf = (id: string): string => `schedules/${encodeURIComponent(id)}`;
 const nameOf = (one: Schedule): string => one.title ?? `Schedule ${one.scheduleID.slice(0, 8)}`;
 
 const nextWords = ({ nextTimes: [next], timeZone }: Schedule): string => (next === undefined ? "–" : clockWords(next, timeZone));
-
-const back = (): HTMLElement => backLink("#/schedules", "All schedules");
 
 const outcomeChip = ({ outcome }: ScheduleRun): HTMLElement => chip(outcome, OUTCOME_WORDS[outcome]);

@@ -14,14 +14,13 @@ import type { View } from "../page/view";
 import { WatchedList } from "../page/watched_list";
 import { Watching } from "../page/watching";
 import { ago } from "../words/numbers";
-import { deliveryChip, DELIVERY_WORDS, receiverState, showDelivery, unsentWords } from "./delivery_view";
+import { deliveryChip, DELIVERY_WORDS, DeliveryView, receiverState, unsentWords } from "./delivery_view";
 
 const REFRESH_MS = 4000;
 
 export function showWebhooks(place: HTMLElement, address: Address): View {
   const [part, id] = address.rest;
-  if (part === "deliveries" && id !== undefined) return showDelivery(place, id);
-  const view = new Webhooks(place);
+  const view = part === "deliveries" && id !== undefined ? new DeliveryView(place, id) : new Webhooks(place);
   view.follow(address);
   return view;
 }
