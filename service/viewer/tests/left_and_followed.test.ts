@@ -29,7 +29,7 @@ vi.mock("../src/scene/scene", () => ({
     select(id: string | null, fly: boolean): void {
       this.selections.push([id, fly]);
     }
-    has = (): boolean => true;
+    readonly models = { has: (): boolean => true, showOnly: (): void => undefined, tint: (): void => undefined };
     groundAt = (): number => 0;
     terrain: Ground | null = null;
     lay(terrain: Ground): void {
@@ -37,8 +37,6 @@ vi.mock("../src/scene/scene", () => ({
     }
     add(): void {}
     finish(): void {}
-    showOnly(): void {}
-    tint(): void {}
     readonly camera = { watch: (): void => undefined, look: (): void => undefined };
     dispose(): void {}
   },

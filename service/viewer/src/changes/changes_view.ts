@@ -225,8 +225,8 @@ class Changes implements View {
       if (old !== null) leftColours.set(old.id, CHANGES[change].colour);
       if (now !== null) rightColours.set(now.id, CHANGES[change].colour);
     }
-    left.tint((id) => leftColours.get(id) ?? null);
-    right.tint((id) => rightColours.get(id) ?? null);
+    left.models.tint((id) => leftColours.get(id) ?? null);
+    right.models.tint((id) => rightColours.get(id) ?? null);
     // the frames differ by a shift: the cameras differ by it, too
     const [x, y, z] = shift;
     const by = { x, y, z };
@@ -302,7 +302,7 @@ class Changes implements View {
     const [old, now] = [pair?.old?.id ?? null, pair?.new?.id ?? null];
     if (pair !== undefined && fly) this.stage.scrollIntoView({ block: "nearest" }); // on narrow screens it does not stay in view
     // one of the cameras leads
-    const leads = now !== null && right?.has(now) === true ? right : left;
+    const leads = now !== null && right?.models.has(now) === true ? right : left;
     left?.select(old, fly && leads === left);
     right?.select(now, fly && leads === right);
     for (const row of this.list.querySelectorAll("tbody tr")) {

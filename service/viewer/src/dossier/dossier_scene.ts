@@ -47,7 +47,7 @@ export class DossierScene {
   constructor(canvas: HTMLCanvasElement, batches: readonly Batch[], points: Points | null, colouring: Colouring) {
     this.scene = new ModelScene(canvas, null);
     this.scene.add(batches);
-    this.scene.colourBy("plain");
+    this.scene.models.colourBy("plain");
     this.cloud = points === null ? null : new Cloud(points);
     if (this.cloud === null) return;
     this.cloud.colour(colouring);

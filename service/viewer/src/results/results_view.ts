@@ -92,7 +92,7 @@ class ResultsView {
       },
       (colouring) => {
         this.colouring = colouring;
-        this.scene?.colourBy(colouring);
+        this.scene?.models.colourBy(colouring);
         this.colourMap();
       },
     );
@@ -184,7 +184,7 @@ class ResultsView {
       return;
     }
     this.note.replaceChildren();
-    this.scene?.replace(batches);
+    this.scene?.models.replace(batches);
     this.scene?.select(this.selected, false);
     this.levels.mark(lod);
     announce(`LoD${lod} is shown.`);
@@ -261,7 +261,7 @@ class ResultsView {
     this.filters.set(wanted, { shown: this.shown.length, all, ...counts });
     this.legend.set(this.objects.counts, wanted.hidden, this.shown);
     const only = isFiltered(wanted) ? new Set(this.shown.map(({ id }) => id)) : null;
-    this.scene?.showOnly(only);
+    this.scene?.models.showOnly(only);
     this.map.showOnly(only);
     if (!this.isLoaded) return;
     if (!wanted.hidden.has("rejected")) void this.loadRejected().catch((error: unknown) => this.fail(error, this.retry));

@@ -42,6 +42,9 @@ export class DrawnModels {
   private marked: string | null = null;
   private colouring: Colouring = "type";
 
+  /** @param onChange Called when something else is to be drawn. */
+  constructor(private readonly onChange: () => void) {}
+
   /** Number of objects. */
   get count(): number {
     return this.places.size;
@@ -71,6 +74,7 @@ export class DrawnModels {
         this.bounds.union(boxOf(batch, index));
       });
     }
+    this.onChange();
   }
 
   /** Put these in place of the models; outlines without a model stay. */
@@ -80,6 +84,11 @@ export class DrawnModels {
     this.places.clear();
     this.bounds.makeEmpty();
     this.add([...staying, ...batches]);
+  }
+
+  /** Height of the lowest and of the highest place. */
+  heights(): [number, number] {
+    return this.bounds.isEmpty() ? [0, 1] : [this.bounds.min.z, this.bounds.max.z];
   }
 
   /** The middle of each model at the height of its floor: x, y, z one after another. */
@@ -110,6 +119,7 @@ export class DrawnModels {
   showOnly(ids: ReadonlySet<string> | null): void {
     this.only = ids;
     for (const drawn of this.drawn) this.showIn(drawn);
+    this.onChange();
   }
 
   /** Choose what the colours of the roofs show. */
@@ -122,6 +132,7 @@ export class DrawnModels {
   /** Colour the roofs of single buildings; null keeps the colour of the roof type. */
   tint(colourOf: (id: string) => string | null): void {
     this.recolour((batch, colours) => tintRoofs(batch, colours, colourOf));
+    this.onChange();
   }
 
   /** Mark a building, or none; returns the box around it. */
@@ -129,6 +140,7 @@ export class DrawnModels {
     this.marked = id;
     if (this.mark !== null) this.remove(this.mark.mesh, this.mark.outline);
     this.mark = null;
+    this.onChange();
     const place = id === null ? undefined : this.places.get(id);
     if (place === undefined) return null;
     const { index, drawn } = place;

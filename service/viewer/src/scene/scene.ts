@@ -2,7 +2,6 @@
 
 import { Color, PCFShadowMap, Scene, Vector2, Vector3, WebGLRenderer, type Ray } from "three";
 import type { Batch } from "../models/batching";
-import type { Colouring } from "../models/colouring";
 import { Camera, TAN_HALF_FOV } from "./camera";
 import { DrawnGround } from "./drawn_ground";
 import { DrawnModels } from "./drawn_models";
@@ -25,7 +24,7 @@ export class ModelScene {
   private readonly renderer: WebGLRenderer;
   private readonly scene = new Scene();
   private readonly light = new Light();
-  private readonly models = new DrawnModels();
+  readonly models = new DrawnModels(() => this.settle());
   private readonly ground = new DrawnGround();
   readonly camera: Camera;
   private readonly pointing: Pointing;
@@ -77,13 +76,6 @@ export class ModelScene {
   add(batches: readonly Batch[]): void {
     this.models.add(batches);
     if (batches.length > 0 && !this.camera.navigation.touched) this.fit(false);
-    this.settle();
-  }
-
-  /** Replace the models by these, seen from the same place; outlines without a model stay. */
-  replace(batches: readonly Batch[]): void {
-    this.models.replace(batches);
-    this.settle();
   }
 
   /** All buildings are added: draw the ground below them. */
@@ -136,40 +128,10 @@ export class ModelScene {
     this.request();
   }
 
-  /** Show these objects and hide all others; null shows all. */
-  showOnly(ids: ReadonlySet<string> | null): void {
-    this.models.showOnly(ids);
-    this.settle();
-  }
-
-  /** Choose what the colours of the roofs show. */
-  colourBy(colouring: Colouring): void {
-    this.models.colourBy(colouring);
-    this.request();
-  }
-
-  /** Colour the roofs of single buildings; null keeps the colour of the roof type. */
-  tint(colourOf: (id: string) => string | null): void {
-    this.models.tint(colourOf);
-    this.request();
-  }
-
-  /** Height of the lowest and of the highest place of the models. */
-  heights(): [number, number] {
-    const { bounds } = this.models;
-    return bounds.isEmpty() ? [0, 1] : [bounds.min.z, bounds.max.z];
-  }
-
-  /** Whether a building is drawn. */
-  has(id: string): boolean {
-    return this.models.has(id);
-  }
-
   /** Mark a building, or none; `fly` brings it into view. */
   select(id: string | null, fly: boolean): void {
     const box = this.models.select(id);
     if (fly && box !== null) this.camera.approach(box);
-    this.request();
   }
 
   /** See everything. */

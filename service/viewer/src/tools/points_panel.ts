@@ -85,7 +85,7 @@ export class PointsPanel {
 
   private colour(): void {
     const { material } = this.layer;
-    const [low, high] = this.scene.heights();
+    const [low, high] = this.scene.models.heights();
     const base = this.frame.origin[2] * this.frame.verticalUnitM;
     material.colourBy(this.colouring);
     material.uniforms["heights"].value = [low, high];
