@@ -20,7 +20,7 @@ afterEach(() => {
 });
 
 async function menu(statuses: Record<string, number>): Promise<HTMLElement> {
-  return document.body.appendChild(await downloadMenu("jobs/1", null, statuses, new AbortController().signal));
+  return document.body.appendChild(await downloadMenu({ jobPath: "jobs/1", method: null }, statuses, new AbortController().signal));
 }
 
 function links(): string[] {

@@ -50,7 +50,7 @@ vi.mock("../src/models/rejected_objects", async (original) => {
   const { request } = await import("../src/api/requests");
   return {
     ...(await original<object>()),
-    rejectedObjects: async (path: string) => (await request(`${path}/results/rejected`)).json(),
+    rejectedObjects: async (run: { jobPath: string }) => (await request(`${run.jobPath}/results/rejected`)).json(),
   };
 });
 

@@ -45,6 +45,19 @@ export function ofRun(path: string, method: string | null): string {
   return `${path}${path.includes("?") ? "&" : "?"}method=${encodeURIComponent(method)}`;
 }
 
+/** A job, or one run of a comparison. */
+export interface Run {
+  readonly jobPath: string;
+  /** The run of a comparison; null for other jobs. */
+  readonly method: string | null;
+}
+
+/** The path of a part of a run. */
+export const partOf = ({ jobPath, method }: Run, part: string): string => ofRun(`${jobPath}/${part}`, method);
+
+/** The path of a building of a run, or of a part of it. */
+export const buildingOf = (run: Run, id: string, part = ""): string => partOf(run, `buildings/${encodeURIComponent(id)}${part}`);
+
 /** The name of a variant in a comparison: the preset is named only if it is not the usual one. */
 export function variantOf(method: string, preset: string, usualPreset: string): string {
   return preset === "" || preset === usualPreset ? method : `${method}:${preset}`;
@@ -98,8 +111,8 @@ export function sendJson(method: string, path: string, body: unknown, headers: R
 }
 
 /** The report of a run; empty if the request left it out. */
-export async function runReport(jobPath: string, method: string | null, signal: AbortSignal): Promise<RunReport> {
-  return (await orNull(getJson<RunReport>(ofRun(`${jobPath}/results/report`, method), { signal }))) ?? {};
+export async function runReport(run: Run, signal: AbortSignal): Promise<RunReport> {
+  return (await orNull(getJson<RunReport>(partOf(run, "results/report"), { signal }))) ?? {};
 }
 
 /** Null for what the service does not have, such as the decisions of older jobs. */

@@ -1,6 +1,6 @@
 /** The dossier of a building: its points over the model, the figures that decided, the forms that were tried. */
 
-import { getJson, ofRun, orNull, request, runReport } from "../api/requests";
+import { buildingOf, getJson, orNull, partOf, request, runReport, type Run } from "../api/requests";
 import type { Decision, Feature } from "../api/types";
 import { Batcher, type Batch } from "../models/batching";
 import type { SceneFrame } from "../models/building_mesh";
@@ -38,7 +38,7 @@ interface Loaded {
 }
 
 /** Show the dossier in front of the page; returns a function that closes it. `onClose` hears of the user's closing. */
-export function openDossier(jobPath: string, method: string | null, buildingId: string, onClose: () => void): () => void {
+export function openDossier(run: Run, buildingId: string, onClose: () => void): () => void {
   const calledOff = new AbortController();
   const body = el("div", { class: "dossier-body", "aria-live": "polite" }, el("p", { class: "loading" }, "Loading…"));
   const dialog = el("dialog", { class: "dossier", "aria-labelledby": "dossier-title" });
@@ -69,7 +69,7 @@ export function openDossier(jobPath: string, method: string | null, buildingId: 
   document.body.append(dialog);
   document.body.classList.add("has-dossier");
   dialog.showModal();
-  load(jobPath, method, buildingId, calledOff.signal).then(
+  load(run, buildingId, calledOff.signal).then(
     (loaded) => {
       if (!calledOff.signal.aborted) end = draw(body, loaded);
     },
@@ -80,21 +80,20 @@ export function openDossier(jobPath: string, method: string | null, buildingId: 
   return close;
 }
 
-async function load(jobPath: string, method: string | null, buildingId: string, signal: AbortSignal): Promise<Loaded> {
-  const path = `${jobPath}/buildings/${encodeURIComponent(buildingId)}`;
+async function load(run: Run, id: string, signal: AbortSignal): Promise<Loaded> {
   const geojson = { signal, headers: { Accept: "application/geo+json" } };
-  const offered = await getJson<Record<string, unknown>>(ofRun(`${jobPath}/results`, method), { signal });
+  const offered = await getJson<Record<string, unknown>>(partOf(run, "results"), { signal });
   const [feature, document, report, decisions, points] = await Promise.all([
-    getJson<Feature>(ofRun(`${path}?crs=native`, method), geojson),
-    getJson<{ CityObjects: unknown; vertices: unknown }>(ofRun(`${path}?f=cityjson`, method), { signal }),
-    "report" in offered ? runReport(jobPath, method, signal) : null,
-    orNull(getJson<{ decisions: Decision[] }>(ofRun(`${path}/decisions`, method), { signal })),
-    "tileset" in offered ? pointsOf(ofRun(`${path}/points`, method), signal) : null,
+    getJson<Feature>(buildingOf(run, id, "?crs=native"), geojson),
+    getJson<{ CityObjects: unknown; vertices: unknown }>(buildingOf(run, id, "?f=cityjson"), { signal }),
+    "report" in offered ? runReport(run, signal) : null,
+    orNull(getJson<{ decisions: Decision[] }>(buildingOf(run, id, "/decisions"), { signal })),
+    "tileset" in offered ? pointsOf(buildingOf(run, id, "/points"), signal) : null,
   ]);
   const reader = new SequenceReader();
   reader.read(JSON.stringify({ ...document, CityObjects: {}, vertices: [] }));
   const { CityObjects, vertices } = document;
-  const building = reader.read(JSON.stringify({ type: "CityJSONFeature", id: buildingId, CityObjects, vertices }));
+  const building = reader.read(JSON.stringify({ type: "CityJSONFeature", id, CityObjects, vertices }));
   if (building === null) throw new Error("the model of the building cannot be read");
   const rings = ringsOf(feature.geometry);
   const [x, y] = rings[0]?.[0] ?? [building.vertices[0] ?? 0, building.vertices[1] ?? 0];

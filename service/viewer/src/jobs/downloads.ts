@@ -1,5 +1,5 @@
 import { waited } from "../api/event_stream";
-import { currentKey, getJson, ofRun, request, serviceUrl } from "../api/requests";
+import { currentKey, getJson, partOf, request, serviceUrl, type Run } from "../api/requests";
 import type { Link } from "../api/types";
 import { dropDown } from "../page/action_menu";
 import { el } from "../page/elements";
@@ -45,6 +45,9 @@ export function pageLink(jobPath: string, name: string): HTMLAnchorElement {
 
 type Offered = Record<string, Link & { bytes?: number }>;
 
+/** The query for the buildings that are ok alone. */
+const OK = "?status=ok";
+
 /** Milliseconds between two questions whether a selection of buildings is made. */
 const ASK_AGAIN_MS = 2000;
 
@@ -52,20 +55,15 @@ const ASK_AGAIN_MS = 2000;
  * A menu of all outputs of the job; for a comparison those of one run, then those of all. Where some buildings are not
  * ok, it offers the outputs of the others alone.
  */
-export async function downloadMenu(
-  jobPath: string,
-  method: string | null,
-  statuses: Record<string, number>,
-  signal: AbortSignal,
-): Promise<HTMLElement> {
-  const list = await downloadList(jobPath, method, signal);
+export async function downloadMenu(run: Run, statuses: Record<string, number>, signal: AbortSignal): Promise<HTMLElement> {
+  const list = await downloadList(run, signal);
   const { ok = 0, ...others } = statuses;
-  if (ok > 0 && Object.values(others).some((count) => count > 0)) list.prepend(onlyOk(list, ok, jobPath, method, signal));
+  if (ok > 0 && Object.values(others).some((count) => count > 0)) list.prepend(onlyOk(list, ok, run, signal));
   return dropDown(el("summary", { class: "button primary" }, "Download"), list);
 }
 
 /** A switch between the outputs of all buildings and those of the ones that are ok. */
-function onlyOk(list: HTMLElement, count: number, jobPath: string, method: string | null, signal: AbortSignal): HTMLElement {
+function onlyOk(list: HTMLElement, count: number, run: Run, signal: AbortSignal): HTMLElement {
   const all = [...list.children];
   const box = el("input", { type: "checkbox" });
   const entry = el("li", { class: "menu-choice" }, el("label", {}, box, ` Only the ${counted(count, "model")} that ${count === 1 ? "is" : "are"} ok`));
@@ -77,8 +75,8 @@ function onlyOk(list: HTMLElement, count: number, jobPath: string, method: strin
   box.addEventListener("change", () => {
     if (!box.checked) return show(all);
     show([el("li", { class: "hint menu-wait", role: "status" }, "These files are being made…")]);
-    selected(`${jobPath}/results?status=ok`, method, signal)
-      .then((offered) => listed(offered, jobPath, method, "?status=ok"))
+    selected(run, signal)
+      .then((offered) => listed(offered, run, OK))
       .catch((error: unknown) => [el("li", {}, problemNotice(asProblem(error)))])
       .then((entries) => {
         if (box.checked) show(entries);
@@ -88,10 +86,10 @@ function onlyOk(list: HTMLElement, count: number, jobPath: string, method: strin
 }
 
 /** The outputs of a selection, once they are made. */
-async function selected(path: string, method: string | null, signal: AbortSignal): Promise<Offered> {
+async function selected(run: Run, signal: AbortSignal): Promise<Offered> {
   for (;;) {
     try {
-      return await getJson<Offered>(ofRun(path, method), { signal });
+      return await getJson<Offered>(partOf(run, `results${OK}`), { signal });
     } catch (error) {
       if (asProblem(error).kind !== "selection-busy") throw error;
       await waited(ASK_AGAIN_MS, signal);
@@ -100,20 +98,21 @@ async function selected(path: string, method: string | null, signal: AbortSignal
 }
 
 /** A list of the same outputs. */
-export async function downloadList(jobPath: string, method: string | null, signal: AbortSignal): Promise<HTMLElement> {
-  const offer = (of: string | null): Promise<Offered> => getJson<Offered>(ofRun(`${jobPath}/results`, of), { signal });
-  const entries = listed(await offer(method), jobPath, method);
-  if (method !== null) {
-    const { page: _page, ...compared } = await offer(null); // the page has a link of its own
-    entries.push(...listed(compared, jobPath, null));
+export async function downloadList(run: Run, signal: AbortSignal): Promise<HTMLElement> {
+  const offer = (of: Run): Promise<Offered> => getJson<Offered>(partOf(of, "results"), { signal });
+  const entries = listed(await offer(run), run);
+  if (run.method !== null) {
+    const comparison = { jobPath: run.jobPath, method: null };
+    const { page: _page, ...compared } = await offer(comparison); // the page has a link of its own
+    entries.push(...listed(compared, comparison));
   }
   return el("ul", { class: "outputs" }, ...entries);
 }
 
 /** Entries of the menu in the words of the service. */
-function listed(offered: Offered, jobPath: string, method: string | null, query = ""): HTMLElement[] {
+function listed(offered: Offered, run: Run, query = ""): HTMLElement[] {
   return Object.entries(offered).map(([name, { title = name, bytes: size }]) => {
     const weight = el("span", { class: "menu-size" }, typeof size === "number" ? bytes(size) : "");
-    return el("li", {}, downloadLink(title, ofRun(`${jobPath}/results/${name}${query}`, method), weight));
+    return el("li", {}, downloadLink(title, partOf(run, `results/${name}${query}`), weight));
   });
 }

@@ -1,6 +1,6 @@
 /** Tiles in Web Mercator beneath the outlines, if the operator of the service names some; they are bent to the map's plane. */
 
-import { getJson, ofRun } from "../api/requests";
+import { getJson, partOf } from "../api/requests";
 import type { Feature } from "../api/types";
 import type { Point } from "../models/plan";
 import type { RunObjects } from "../models/run_objects";
@@ -25,13 +25,14 @@ interface TileSource {
 }
 
 /** Lay the operator's tiles beneath the map of a run, if the results lie on Earth. */
-export async function layBackground(map: OutlineMap, { jobPath, method, report: { crs }, frame }: RunObjects, signal: AbortSignal): Promise<void> {
+export async function layBackground(map: OutlineMap, run: RunObjects, signal: AbortSignal): Promise<void> {
   const given = (name: string): string => document.querySelector<HTMLMetaElement>(`meta[name="${name}"]`)?.content ?? "";
+  const { report: { crs }, frame } = run;
   const source: TileSource = { template: given("map-tiles"), credit: given("map-credit"), maxZoom: Number(given("map-max-zoom")) };
   if (source.template === "" || (crs?.to_wgs84 ?? null) === null) return;
   const { origin: [east, north], horizontalUnitM: unit } = frame;
   const inPlane = ([x, y]: Point): Point => [(x - east) * unit, (y - north) * unit];
-  const place = await locate(jobPath, method, inPlane, signal);
+  const place = await locate(run, inPlane, signal);
   if (place === null) return;
   const within = place.errorM < 0.5 ? "" : ` · placed to within ${measure(place.errorM, 1, "m")}`;
   map.lay(new Background(source, place, map.request), `${source.credit}${within}`);
@@ -43,14 +44,9 @@ export async function layBackground(map: OutlineMap, { jobPath, method, report: 
  * @param inPlane From the coordinates of the tiles to the plane of the map.
  * @returns Null if the results have too few outlines.
  */
-async function locate(
-  jobPath: string,
-  method: string | null,
-  inPlane: (place: Point) => Point,
-  signal: AbortSignal,
-): Promise<Georeference | null> {
+async function locate(run: RunObjects, inPlane: (place: Point) => Point, signal: AbortSignal): Promise<Georeference | null> {
   const page = async (crs: string): Promise<Feature[]> => {
-    const path = ofRun(`${jobPath}/buildings?limit=${SAMPLE}&crs=${crs}`, method);
+    const path = partOf(run, `buildings?limit=${SAMPLE}&crs=${crs}`);
     return (await getJson<{ features: Feature[] }>(path, { signal, headers: { Accept: "application/geo+json" } })).features;
   };
   const [native, degrees] = await Promise.all([page("native"), page("CRS84")]);

@@ -69,7 +69,7 @@ export function showJob(place: HTMLElement, named: Place): View {
 
 /** A job whose results are files without buildings. */
 async function files(job: StatusInfo, path: string, signal: AbortSignal): Promise<HTMLElement> {
-  const list = await downloadList(path, null, signal);
+  const list = await downloadList({ jobPath: path, method: null }, signal);
   return el("div", { class: "card" }, heading(job), el("p", {}, job.message ?? ""), list);
 }
 

@@ -1,6 +1,6 @@
 /** The record of one object, beside the models. */
 
-import { getJson, ofRun } from "../api/requests";
+import { buildingOf, getJson, type Run } from "../api/requests";
 import type { Feature } from "../api/types";
 import { dossierLink, followDossier } from "../dossier/dossier_link";
 import { downloadLink } from "../jobs/downloads";
@@ -17,26 +17,20 @@ import { CATEGORIES, categoryOf, type Category } from "../words/roof_types";
 
 type Properties = Feature["properties"];
 
-/** A building of a run. */
-export interface Named {
-  jobPath: string;
-  method: string | null;
-  id: string;
-  /** Metres per unit of the elevations in its record. */
-  elevationUnitM: number;
-}
-
-/** Show the record of one building; returns a function that stops the loading. */
-export function showRecord(place: HTMLElement, named: Named): () => void {
+/**
+ * Show the record of one building; returns a function that stops the loading.
+ *
+ * @param elevationUnitM Metres per unit of the elevations in it.
+ */
+export function showRecord(place: HTMLElement, run: Run, id: string, elevationUnitM: number): () => void {
   const calledOff = new AbortController();
   const { signal } = calledOff;
-  const { jobPath, method, id } = named;
-  const path = `${jobPath}/buildings/${encodeURIComponent(id)}`;
   const load = (): void => {
     place.replaceChildren(el("p", { class: "loading" }, "Loading…"));
-    getJson<Feature>(ofRun(path, method), { signal, headers: { Accept: "application/geo+json" } }).then(
+    getJson<Feature>(buildingOf(run, id), { signal, headers: { Accept: "application/geo+json" } }).then(
       ({ properties }) => {
-        if (!signal.aborted) place.replaceChildren(...record(properties, named));
+        if (signal.aborted) return;
+        place.replaceChildren(...record(properties, id, elevationUnitM), ...takeAway(properties, run, id));
       },
       (error: unknown) => {
         if (!signal.aborted) report(place, error, load);
@@ -44,18 +38,20 @@ export function showRecord(place: HTMLElement, named: Named): () => void {
     );
   };
   load();
-  followDossier(jobPath, method, id, signal);
+  followDossier(run, id, signal);
   return () => calledOff.abort();
 }
+
+const isModelled = ({ status }: Properties): boolean => status === "ok" || status === "doubtful" || status === "fallback";
 
 function heading(category: Category, words: string, id: string): HTMLElement {
   return el("div", { class: "record-head" }, el("h2", {}, swatch(category), words), el("code", { class: "record-id", title: id }, id));
 }
 
-function record(properties: Properties, named: Named): HTMLElement[] {
+function record(properties: Properties, id: string, elevationUnitM: number): HTMLElement[] {
   const { status, reason, reason_detail: detail, lod, valid } = properties;
   const category = categoryOf(status, properties["roof_type"]);
-  const modelled = status === "ok" || status === "doubtful" || status === "fallback";
+  const modelled = isModelled(properties);
   const roof = ["doubtful", "fallback", "failed"].includes(category) ? "" : " roof";
   const marks: [string, string, boolean][] = [
     ["mark-plain", `LoD${String(lod)}`, typeof lod === "string"],
@@ -67,14 +63,13 @@ function record(properties: Properties, named: Named): HTMLElement[] {
   const hasReason = typeof reason === "string" && reason !== "";
   const codes = Array.isArray(properties["validity_codes"]) ? properties["validity_codes"] : [];
   const parts = [
-    heading(category, category === "unknown" ? "Other roof" : CATEGORIES[category].label + roof, named.id),
+    heading(category, category === "unknown" ? "Other roof" : CATEGORIES[category].label + roof, id),
     el("ul", { class: "marks" }, ...marks.filter(([, , isThere]) => isThere).map(([kind, words]) => el("li", { class: kind }, words))),
     hasReason ? warningNotice(`${capital(reasonWords(reason))}${typeof detail === "string" && detail !== "" ? `: ${detail}` : "."}`) : null,
     el("div", { class: "record-links" }, dossierLink()),
     codes.length > 0 ? el("p", { class: "hint" }, `Codes of the method's own solid: ${codes.join(", ")}`) : null,
-    ...sections(properties, named.elevationUnitM),
+    ...sections(properties, elevationUnitM),
     planes(properties["planes"]),
-    modelled ? takeAway(properties["mesh_path"], named) : null,
   ];
   return parts.filter((part) => part !== null);
 }
@@ -106,15 +101,12 @@ function planes(value: unknown): HTMLElement | null {
 }
 
 /** Downloads of one building; a job has meshes of one kind, or none. */
-function takeAway(meshPath: unknown, { jobPath, method, id }: Named): HTMLElement {
-  const path = `${jobPath}/buildings/${encodeURIComponent(id)}`;
-  const kind = typeof meshPath === "string" ? meshPath.slice(meshPath.lastIndexOf(".") + 1) : null;
-  return el(
-    "div",
-    { class: "record-links" },
-    kind === null ? null : downloadLink(kind.toUpperCase(), ofRun(`${path}?f=${kind}`, method)),
-    downloadLink("CityJSON", ofRun(`${path}?f=cityjson`, method)),
-  );
+function takeAway(properties: Properties, run: Run, id: string): HTMLElement[] {
+  if (!isModelled(properties)) return [];
+  const path = properties["mesh_path"];
+  const kinds = typeof path === "string" ? [path.slice(path.lastIndexOf(".") + 1)] : [];
+  const links = [...kinds.map((kind) => [kind.toUpperCase(), kind]), ["CityJSON", "cityjson"]];
+  return [el("div", { class: "record-links" }, ...links.map(([label, kind]) => downloadLink(label, buildingOf(run, id, `?f=${kind}`))))];
 }
 
 const OF_REJECTED: [FigureName, string][] = [

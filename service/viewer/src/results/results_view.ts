@@ -36,7 +36,6 @@ export function showResults(place: HTMLElement, job: StatusInfo, named: Place): 
 
 class ResultsView {
   private readonly calledOff = new AbortController();
-  private readonly jobPath: string;
   /** Labels of the runs of a comparison; empty for other jobs. */
   private readonly methods: string[];
   /** The one whose models are shown. */
@@ -82,8 +81,7 @@ class ResultsView {
   ) {
     this.methods = Object.keys(job.summary?.runs ?? {});
     this.method = named ?? this.methods[0] ?? null;
-    this.jobPath = pathOfJob(job.jobID);
-    this.objects = new RunObjects(this.jobPath, this.method);
+    this.objects = new RunObjects(pathOfJob(job.jobID), this.method);
     this.viewTools = new ViewTools(this.objects);
     this.list = new BuildingList((id) => this.address(id));
     this.legend = new Legend(
@@ -121,7 +119,7 @@ class ResultsView {
     const { summary } = this.job;
     const statuses = (this.method === null ? summary : summary?.runs?.[this.method])?.statuses ?? {};
     const [menu] = await Promise.all([
-      downloadMenu(this.jobPath, this.method, statuses, this.calledOff.signal),
+      downloadMenu(this.objects, statuses, this.calledOff.signal),
       this.objects.readReport(this.calledOff.signal),
     ]);
     if (this.calledOff.signal.aborted) return;
@@ -323,7 +321,7 @@ class ResultsView {
     const options = this.methods.map((label) => el("option", { value: label, selected: label === this.method }, label));
     const select = el("select", { "aria-label": "Models of the method", onchange: follow }, ...options);
     const hasPage = this.job.links?.some(({ type }) => type === "text/html") === true;
-    const page = pageLink(this.jobPath, "The methods side by side");
+    const page = pageLink(this.objects.jobPath, "The methods side by side");
     page.classList.add("button", "quiet");
     return hasPage ? [select, page] : [select];
   }
@@ -400,8 +398,7 @@ class ResultsView {
     if (id === null) return this.panel.showList(before);
     this.panel.showRecord(id, !fly, before === null, (body) => {
       const object = this.objects.rejected.get(id);
-      const named = { jobPath: this.jobPath, method: this.method, id, elevationUnitM: elevationUnitM(this.objects.report.crs) };
-      if (object === undefined) return showRecord(body, named);
+      if (object === undefined) return showRecord(body, this.objects, id, elevationUnitM(this.objects.report.crs));
       body.replaceChildren(...rejectedRecord(object));
       return () => undefined;
     });

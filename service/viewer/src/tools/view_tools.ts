@@ -1,4 +1,4 @@
-import { getJson, ofRun } from "../api/requests";
+import { getJson, partOf } from "../api/requests";
 import { originInMetres } from "../models/building_mesh";
 import type { RunObjects } from "../models/run_objects";
 import { button, el, isPressed, setPressed } from "../page/elements";
@@ -56,9 +56,8 @@ export class ViewTools {
 
   /** Offer the points of the run, and draw their terrain, if it has any. */
   async offerPoints(): Promise<void> {
-    const { jobPath, method } = this.run;
     await this.tried(async (signal) => {
-      const outputs = await getJson<Record<string, unknown>>(ofRun(`${jobPath}/results`, method), { signal });
+      const outputs = await getJson<Record<string, unknown>>(partOf(this.run, "results"), { signal });
       if (!("tileset" in outputs)) return;
       this.element.prepend(this.points);
       await this.tried((again) => this.layTerrain(again));
@@ -67,11 +66,10 @@ export class ViewTools {
 
   /** Draw the terrain of a run with points; those of earlier versions have none. */
   private async layTerrain(signal: AbortSignal): Promise<void> {
-    const { jobPath, method, frame } = this.run;
-    const tileset = await getJson<RawTileset>(ofRun(`${jobPath}/points/tileset.json`, method), { signal });
+    const tileset = await getJson<RawTileset>(partOf(this.run, "points/tileset.json"), { signal });
     const file = factsOf(tileset).terrain;
-    const terrain = file === null ? null : await getJson<TerrainFile>(ofRun(`${jobPath}/points/${file}`, method), { signal });
-    const ground = terrain === null ? null : groundOf(terrain, originInMetres(frame));
+    const terrain = file === null ? null : await getJson<TerrainFile>(partOf(this.run, `points/${file}`), { signal });
+    const ground = terrain === null ? null : groundOf(terrain, originInMetres(this.run.frame));
     if (ground !== null && !signal.aborted) this.scene?.lay(ground, false);
   }
 
