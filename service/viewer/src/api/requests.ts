@@ -131,15 +131,16 @@ export function unreachable(): Problem {
 
 /** A problem from an answer; for another body the text of the status line. */
 export function problemOf(status: number, reason: string, body: string, retryAfter: string | null): Problem {
-  let document: { type?: unknown; title?: unknown; detail?: unknown } = {};
+  let document: Record<string, unknown> = {};
   try {
-    document = JSON.parse(body) as typeof document;
+    document = (JSON.parse(body) as typeof document | null) ?? {};
   } catch {
-    document = {};
+    // the status says what is known
   }
-  const title = typeof document?.title === "string" ? document.title : reason || `Status ${status}`;
-  const detail = typeof document?.detail === "string" ? document.detail : "";
-  const kind = typeof document?.type === "string" ? (document.type.split(/[:/]/).at(-1) ?? "") : "";
+  const text = (name: string): string => (typeof document[name] === "string" ? document[name] : "");
+  const title = text("title") || reason || `Status ${status}`;
+  const detail = text("detail");
+  const kind = text("type").split(/[:/]/).at(-1) ?? "";
   // about keys, the service speaks to programmers and operators
   if (kind === "unauthorized") return new Problem(status, "This service needs a key", "", remedyOf(status, retryAfter), kind);
   if (kind === "forbidden") return new Problem(status, title, detail.split(": ")[0] ?? "", remedyOf(status, retryAfter), kind);
@@ -156,30 +157,26 @@ const REMEDIES: Record<string, string> = {
   "not-replayable": "Wait until the attempt that is under way is over.",
 };
 
+const CORRECT = "Correct what is named above and send it again.";
+const REMOVED = "It may have been removed. Go back to the list.";
+
+const BY_STATUS: Record<number, string> = {
+  400: CORRECT,
+  401: "Enter a valid key. The operator of this service gives you one.",
+  403: "Your key may not do that. Ask the operator of this service for one that may.",
+  404: REMOVED,
+  410: REMOVED,
+  413: "Split the tile, or ask the service's operator to raise the limit.",
+  415: CORRECT,
+  422: CORRECT,
+  429: "Wait a little, then try again.",
+  503: "The service cannot take work at the moment. Try again in a minute.",
+};
+
 function remedyOf(status: number, retryAfter: string | null): string {
-  switch (status) {
-    case 401:
-      return "Enter a valid key. The operator of this service gives you one.";
-    case 403:
-      return "Your key may not do that. Ask the operator of this service for one that may.";
-    case 404:
-    case 410:
-      return "It may have been removed. Go back to the list.";
-    case 413:
-      return "Split the tile, or ask the service's operator to raise the limit.";
-    case 429: {
-      const seconds = Number(retryAfter);
-      return seconds > 0 ? `Try again in ${counted(Math.ceil(seconds), "second")}.` : "Wait a little, then try again.";
-    }
-    case 400:
-    case 415:
-    case 422:
-      return "Correct what is named above and send it again.";
-    case 503:
-      return "The service cannot take work at the moment. Try again in a minute.";
-    default:
-      return status >= 500 ? "This is a fault of the service: its operator finds more in its log." : "";
-  }
+  const seconds = Number(retryAfter);
+  if (status === 429 && seconds > 0) return `Try again in ${counted(Math.ceil(seconds), "second")}.`;
+  return BY_STATUS[status] ?? (status >= 500 ? "This is a fault of the service: its operator finds more in its log." : "");
 }
 
 /**

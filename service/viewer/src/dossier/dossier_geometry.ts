@@ -2,6 +2,7 @@
 
 import { inScene, type SceneFrame } from "../models/building_mesh";
 import type { Building, Face } from "../models/cityjson";
+import { areaOf, type Point } from "../models/plan";
 import { ringNormal, type Normal } from "../models/triangulation";
 
 export type Xyz = readonly [number, number, number];
@@ -23,8 +24,8 @@ export interface RoofEdge {
 
 /** A vertical plane through the building: `t` metres along `along` from `at`. */
 export interface Section {
-  at: readonly [number, number];
-  along: readonly [number, number];
+  at: Point;
+  along: Point;
   /** Words for the caption. */
   through: string;
 }
@@ -32,8 +33,8 @@ export interface Section {
 /** A piece of the model in a section. */
 export interface Cut {
   kind: Face["kind"];
-  from: readonly [number, number];
-  to: readonly [number, number];
+  from: Point;
+  to: Point;
 }
 
 /** The points of a building: x, y, z in metres around the frame's origin, with the model's answer to each. */
@@ -116,25 +117,15 @@ export function sectionOf(model: Model, edges: readonly RoofEdge[]): Section | n
   return { at: largest.middle, along: eastward(along), through: flat ? "along the largest face" : "down the largest face" };
 }
 
-function measured(model: Model, face: Face): { area: number; normal: Normal; middle: readonly [number, number] } {
-  const ring = (face.rings[0] ?? []).map((index) => vertex(model, index));
-  const [ox, oy] = ring[0] ?? [0, 0];
-  let area = 0;
-  let mx = 0;
-  let my = 0;
-  ring.forEach(([x0, y0], i) => {
-    const [x1, y1] = ring[(i + 1) % ring.length];
-    const cross = (x0 - ox) * (y1 - oy) - (x1 - ox) * (y0 - oy);
-    area += cross / 2;
-    mx += ((x0 + x1 - 2 * ox) * cross) / 6;
-    my += ((y0 + y1 - 2 * oy) * cross) / 6;
-  });
-  const middle = area === 0 ? ([ox, oy] as const) : ([ox + mx / area, oy + my / area] as const);
-  return { area: Math.abs(area), normal: ringNormal(model.vertices, face.rings[0] ?? []), middle };
+function measured(model: Model, face: Face): { area: number; normal: Normal; middle: Point } {
+  const outer = face.rings[0] ?? [];
+  const ring = outer.map((index) => vertex(model, index)).map(([x, y]): Point => [x, y]);
+  const mean = (axis: 0 | 1): number => ring.reduce((sum, place) => sum + place[axis], 0) / ring.length;
+  return { area: Math.abs(areaOf(ring)), normal: ringNormal(model.vertices, outer), middle: [mean(0), mean(1)] };
 }
 
-function longestSide(edges: readonly RoofEdge[]): readonly [number, number] {
-  let best: readonly [number, number] = [1, 0];
+function longestSide(edges: readonly RoofEdge[]): Point {
+  let best: Point = [1, 0];
   let longest = 0;
   for (const { from, to } of edges) {
     const side = [to[0] - from[0], to[1] - from[1]] as const;
@@ -143,13 +134,13 @@ function longestSide(edges: readonly RoofEdge[]): readonly [number, number] {
   return best;
 }
 
-function unit([x, y]: readonly [number, number]): readonly [number, number] {
+function unit([x, y]: Point): Point {
   const length = Math.hypot(x, y);
   return length === 0 ? [1, 0] : [x / length, y / length];
 }
 
 /** So that east, or north, is to the right. */
-function eastward([x, y]: readonly [number, number]): readonly [number, number] {
+function eastward([x, y]: Point): Point {
   return x < -1e-9 || (Math.abs(x) <= 1e-9 && y < 0) ? [-x, -y] : [x, y];
 }
 

@@ -3,7 +3,7 @@
 const NARROW = "\u202f";
 
 export function count(value: number): string {
-  return Math.round(value).toString().replace(/\B(?=(\d{3})+$)/g, NARROW);
+  return measure(value, 0);
 }
 
 /** `1 building`, `2 buildings`. */
@@ -13,9 +13,8 @@ export function counted(value: number, noun: string): string {
 
 export function measure(value: unknown, digits: number, unit = ""): string {
   if (typeof value !== "number" || !Number.isFinite(value)) return "–";
-  const [whole, fraction] = Math.abs(value).toFixed(digits).split(".");
-  const sign = value < 0 && Number(value.toFixed(digits)) !== 0 ? "−" : "";
-  const text = sign + whole.replace(/\B(?=(\d{3})+$)/g, NARROW) + (fraction === undefined ? "" : `.${fraction}`);
+  const places = { minimumFractionDigits: digits, maximumFractionDigits: digits, signDisplay: "negative" } as const;
+  const text = value.toLocaleString("en", places).replaceAll(",", NARROW).replace("-", "−");
   return unit === "" ? text : `${text}${NARROW}${unit}`;
 }
 
