@@ -104,3 +104,15 @@ test("a chimney does not turn a roof red: its few points leave the class, howeve
   expect(listed[0].figures.residual).toBe(1.2);
   expect(classesOf("residual", listed.slice(0, 1))[0].colour).toBe("#0072b2");
 });
+
+test("single buildings have a colour of their own, the others that of their type", () => {
+  const { batches } = batched();
+  const batch = batches.find(({ ids }) => ids.includes("b")) as Batch;
+  const colours = coloursOf(batch, (id) => (id === "b" ? "#ff0080" : null));
+  const roofs = batch.ids.map((_, n) => {
+    const corner = [...batch.surfaces].findIndex((surface, at) => at >= batch.starts[n] && surface >= 0);
+    return [...colours.subarray(4 * corner, 4 * corner + 4)];
+  });
+  const own = [...linear(CATEGORIES[batch.category].colour), 255];
+  expect(roofs).toEqual(batch.ids.map((id) => (id === "b" ? [255, 0, 55, 255] : own)));
+});

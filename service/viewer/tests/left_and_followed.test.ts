@@ -29,7 +29,7 @@ vi.mock("../src/scene/scene", () => ({
     select(id: string | null, fly: boolean): void {
       this.selections.push([id, fly]);
     }
-    readonly models = { has: (): boolean => true, showOnly: (): void => undefined, tint: (): void => undefined };
+    readonly models = { has: (): boolean => true, showOnly: (): void => undefined, colourBy: (): void => undefined };
     groundAt = (): number => 0;
     terrain: Ground | null = null;
     lay(terrain: Ground): void {

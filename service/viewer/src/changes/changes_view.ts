@@ -225,8 +225,8 @@ class Changes implements View {
       if (old !== null) leftColours.set(old.id, CHANGES[change].colour);
       if (now !== null) rightColours.set(now.id, CHANGES[change].colour);
     }
-    left.models.tint((id) => leftColours.get(id) ?? null);
-    right.models.tint((id) => rightColours.get(id) ?? null);
+    left.models.colourBy((id) => leftColours.get(id) ?? null);
+    right.models.colourBy((id) => rightColours.get(id) ?? null);
     // the frames differ by a shift: the cameras differ by it, too
     const [x, y, z] = shift;
     const by = { x, y, z };

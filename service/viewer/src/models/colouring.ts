@@ -93,39 +93,37 @@ function classOf(
   }
 }
 
-/** The colour of an object's outline on the map; outlines have no planes. */
+/** What the colours of roofs show: one of the choices, or a colour for each id; null is that of the type. */
+export type RoofColours = Colouring | ((id: string) => string | null);
+
+function colourOf(colouring: Colouring, category: Category, reason: string | null, withinShare: number | null): string {
+  if (colouring === "type") return CATEGORIES[category].colour;
+  if (colouring === "plain") return PLAIN;
+  return colouring === "plane" ? GREY : classOf(colouring, category, reason, withinShare).colour;
+}
+
+/** The colour of an object's outline on the map; outlines have no planes, and none but grey are seen without colours. */
 export function outlineColour(colouring: Colouring, { category, reason, figures }: Listed): string {
-  switch (colouring) {
-    case "type":
-      return CATEGORIES[category].colour;
-    case "plane":
-    case "plain":
-      return GREY;
-    default:
-      return classOf(colouring, category, reason, figures.within ?? null).colour;
-  }
+  return colouring === "plain" ? GREY : colourOf(colouring, category, reason, figures.within ?? null);
 }
 
 /** Red, green, blue, opaque for each corner of a batch; in the linear space that three works in. */
-export function coloursOf(batch: Batch, colouring: Colouring): Uint8Array {
-  const colours = new Uint8Array(4 * batch.surfaces.length).fill(255);
+export function coloursOf(batch: Batch, shown: RoofColours): Uint8Array {
+  const { ids, category, reasons, withinShare, starts, surfaces } = batch;
+  const colours = new Uint8Array(4 * surfaces.length).fill(255);
   const cycle = CYCLE.map(linear);
-  for (let building = 0; building < batch.ids.length; building++) {
-    let roof = linear(GREY); // of faces without a numbered plane
-    if (colouring === "type") roof = linear(CATEGORIES[batch.category].colour);
-    else if (colouring === "plain") roof = linear(PLAIN);
-    else if (colouring !== "plane") {
-      roof = linear(classOf(colouring, batch.category, batch.reasons[building], batch.withinShare[building]).colour);
-    }
-    for (let corner = batch.starts[building]; corner < batch.starts[building + 1]; corner++) {
-      const surface = batch.surfaces[corner];
+  ids.forEach((id, n) => {
+    const given = typeof shown === "function" ? shown(id) : null;
+    const roof = linear(given ?? colourOf(typeof shown === "function" ? "type" : shown, category, reasons[n], withinShare[n]));
+    for (let corner = starts[n]; corner < starts[n + 1]; corner++) {
+      const surface = surfaces[corner];
       let colour = roof;
       if (surface === SURFACE.wall) colour = WALL;
       else if (surface === SURFACE.ground) colour = FLOOR;
-      else if (colouring === "plane" && surface >= 0) colour = cycle[surface % cycle.length];
-      for (let part = 0; part < 3; part++) colours[4 * corner + part] = colour[part];
+      else if (shown === "plane" && surface >= 0) colour = cycle[surface % cycle.length];
+      colours.set(colour, 4 * corner);
     }
-  }
+  });
   return colours;
 }
 
@@ -135,21 +133,3 @@ function linear(colour: string): number[] {
 }
 
 const [WALL, FLOOR] = [linear("#ece7de"), linear("#b9b3a8")];
-
-/**
- * Colour the roofs of single buildings.
- *
- * @param colours Red, green, blue and a fourth byte per corner, in linear light; changed in place.
- * @param colourOf The colour of a building as `#rrggbb`; null keeps its own.
- */
-export function tintRoofs(batch: Batch, colours: Uint8Array, colourOf: (id: string) => string | null): void {
-  batch.ids.forEach((id, index) => {
-    const colour = colourOf(id);
-    if (colour === null) return;
-    const bytes = linear(colour);
-    for (let corner = batch.starts[index]; corner < batch.starts[index + 1]; corner++) {
-      const surface = batch.surfaces[corner];
-      if (surface !== SURFACE.wall && surface !== SURFACE.ground) colours.set(bytes, 4 * corner);
-    }
-  });
-}

@@ -15,7 +15,7 @@ import { LineMaterial } from "three/addons/lines/LineMaterial.js";
 import { LineSegments2 } from "three/addons/lines/LineSegments2.js";
 import { LineSegmentsGeometry } from "three/addons/lines/LineSegmentsGeometry.js";
 import type { Batch } from "../models/batching";
-import { coloursOf, tintRoofs, type Colouring } from "../models/colouring";
+import { coloursOf, type RoofColours } from "../models/colouring";
 import { isFlat, isHatched } from "../words/roof_types";
 import { hatched } from "./hatching";
 import { boxOf, pick, type Hit } from "./picking";
@@ -40,7 +40,7 @@ export class DrawnModels {
   private only: ReadonlySet<string> | null = null;
   private mark: { mesh: Mesh; outline: LineSegments2 } | null = null;
   private marked: string | null = null;
-  private colouring: Colouring = "type";
+  private colouring: RoofColours = "type";
 
   /** @param onChange Called when something else is to be drawn. */
   constructor(private readonly onChange: () => void) {}
@@ -123,16 +123,13 @@ export class DrawnModels {
   }
 
   /** Choose what the colours of the roofs show. */
-  colourBy(colouring: Colouring): void {
+  colourBy(colouring: RoofColours): void {
     this.colouring = colouring;
-    this.recolour((batch, colours) => colours.set(coloursOf(batch, colouring)));
+    for (const { batch, mesh } of this.drawn) {
+      coloursIn(mesh).set(coloursOf(batch, colouring));
+      mesh.geometry.getAttribute("color").needsUpdate = true;
+    }
     this.select(this.marked);
-  }
-
-  /** Colour the roofs of single buildings; null keeps the colour of the roof type. */
-  tint(colourOf: (id: string) => string | null): void {
-    this.recolour((batch, colours) => tintRoofs(batch, colours, colourOf));
-    this.onChange();
   }
 
   /** Mark a building, or none; returns the box around it. */
@@ -187,13 +184,6 @@ export class DrawnModels {
     mesh.visible = edges.visible = shown?.includes(1) ?? true;
     drawOnly(mesh.geometry, batch.starts, shown);
     drawOnly(edges.geometry, batch.edgeStarts, shown);
-  }
-
-  private recolour(change: (batch: Batch, colours: Uint8Array) => void): void {
-    for (const { batch, mesh } of this.drawn) {
-      change(batch, coloursIn(mesh));
-      mesh.geometry.getAttribute("color").needsUpdate = true;
-    }
   }
 
   private remove(...objects: (Mesh | LineSegments | LineSegments2)[]): void {
