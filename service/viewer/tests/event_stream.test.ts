@@ -1,5 +1,5 @@
 import { expect, test } from "vitest";
-import { eventsOf, type ServerEvent } from "../src/api/event_stream";
+import { eventsOf, waited, type ServerEvent } from "../src/api/event_stream";
 
 const STREAM = ': hello\nretry: 1500\n\nid: 1\nevent: stage\ndata: {"a":1}\n\ndata: two\ndata: lines\nid: 2\n\nevent: idle\n\ndata:last\r\n\r\n';
 
@@ -25,4 +25,13 @@ test("events do not depend on how the stream is cut, and the server's wish for a
 
 test("an unfinished event is not reported", async () => {
   expect(await read("data: half\n", 100)).toEqual([]);
+});
+
+test("nothing waits that was called off, before or meanwhile", async () => {
+  const calledOff = new AbortController();
+  const waiting = waited(60_000, calledOff.signal);
+  calledOff.abort();
+  await expect(waiting).rejects.toThrow("cancelled");
+  await expect(waited(60_000, calledOff.signal)).rejects.toThrow();
+  await waited(1, new AbortController().signal);
 });

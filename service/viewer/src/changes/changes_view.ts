@@ -220,13 +220,10 @@ class Changes implements View {
     }
     const [left, right] = this.scenes;
     if (left === null || right === null) return;
-    const [leftColours, rightColours] = [new Map<string, string>(), new Map<string, string>()];
-    for (const { change, old, new: now } of this.found) {
-      if (old !== null) leftColours.set(old.id, CHANGES[change].colour);
-      if (now !== null) rightColours.set(now.id, CHANGES[change].colour);
+    for (const [scene, side] of [[left, "old"], [right, "new"]] as const) {
+      const colours = new Map(this.found.map((pair) => [pair[side]?.id, CHANGES[pair.change].colour]));
+      scene.models.colourBy((id) => colours.get(id) ?? null);
     }
-    left.models.colourBy((id) => leftColours.get(id) ?? null);
-    right.models.colourBy((id) => rightColours.get(id) ?? null);
     // the frames differ by a shift: the cameras differ by it, too
     const [x, y, z] = shift;
     const by = { x, y, z };

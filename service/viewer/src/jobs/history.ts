@@ -74,6 +74,7 @@ class History extends WatchedList<StatusInfo> {
     this.status.value = query.get("status") ?? "";
     this.process.value = query.get("processID") ?? "";
     super.follow(address);
+    this.only.replaceChildren(...this.ofSchedule());
   }
 
   override leave(): void {
@@ -94,7 +95,6 @@ class History extends WatchedList<StatusInfo> {
 
   protected override summary({ numberMatched = 0 }: Answer): string {
     this.tally.textContent = numberMatched === 0 ? "" : counted(numberMatched, "job");
-    this.only.replaceChildren(...this.ofSchedule());
     return counted(numberMatched, "job");
   }
 

@@ -53,6 +53,7 @@ export class BuildingsSoFar {
     // where the answer is a problem, the events of the job tell it, too
     while (!(await this.ask().catch(() => false))) {
       await waited(PAUSE_MS, this.signal);
+      if (!this.element.isConnected) return;
     }
   }
 
