@@ -1,9 +1,8 @@
 import { expect, test } from "vitest";
 import type { Decision } from "../src/api/types";
 import { pointColour, tickStep } from "../src/dossier/dossier_drawings";
-import { cutModel, histogram, modelOf, roofEdges, sectionOf, strip, stripWidth, type Points } from "../src/dossier/dossier_geometry";
+import { cutModel, histogram, modelOf, pointsIn, roofEdges, sectionOf, strip, stripWidth, type Points } from "../src/dossier/dossier_geometry";
 import { dossierAddress, isDossier } from "../src/dossier/dossier_link";
-import { pointsIn } from "../src/dossier/dossier_points";
 import { checkRows, formRows, trust, trustFigures, withinWords } from "../src/dossier/dossier_words";
 import { SequenceReader } from "../src/models/cityjson";
 import { placeOf } from "../src/page/address";

@@ -17,8 +17,9 @@ import { LineSegmentsGeometry } from "three/addons/lines/LineSegmentsGeometry.js
 import type { Batch } from "../models/batching";
 import { coloursOf, type RoofColours } from "../models/colouring";
 import { isFlat, isHatched } from "../words/roof_types";
-import { hatched } from "./hatching";
 import { boxOf, pick, type Hit } from "./picking";
+
+const STRIPES_M = 1.6;
 
 interface Drawn {
   batch: Batch;
@@ -208,4 +209,24 @@ function drawOnly(geometry: BufferGeometry, starts: Uint32Array, shown: Uint8Arr
   index.needsUpdate = true;
   geometry.setIndex(index);
   geometry.setDrawRange(0, n);
+}
+
+/** Draws dark slanted stripes over a material, as a sign in addition to the colour. */
+function hatched(material: MeshLambertMaterial): MeshLambertMaterial {
+  material.onBeforeCompile = (shader) => {
+    shader.vertexShader = shader.vertexShader
+      .replace("#include <common>", "#include <common>\nvarying vec3 vHatched;")
+      .replace("#include <begin_vertex>", "#include <begin_vertex>\nvHatched = position;");
+    shader.fragmentShader = shader.fragmentShader
+      .replace("#include <common>", "#include <common>\nvarying vec3 vHatched;")
+      .replace(
+        "#include <color_fragment>",
+        `#include <color_fragment>
+        float along = (vHatched.x + vHatched.y + vHatched.z) / ${STRIPES_M.toFixed(2)};
+        float blur = clamp(fwidth(along), 0.0, 0.5);
+        float stripe = smoothstep(0.5 - blur, 0.5 + blur, abs(fract(along) * 2.0 - 1.0));
+        diffuseColor.rgb *= mix(0.55, 1.0, stripe);`,
+      );
+  };
+  return material;
 }

@@ -4,8 +4,8 @@ import { announce } from "../page/notices";
 import { facts } from "../page/tables";
 import type { Tool } from "../scene/layer";
 import type { ModelScene } from "../scene/scene";
+import { measure } from "../words/numbers";
 import { MeasureDrawing } from "./measure_drawing";
-import { inWords, measured } from "./measuring";
 
 const STEP_PX = 16; // of the cross, with an arrow key
 const FINE_PX = 1; // the same with Shift
@@ -100,7 +100,7 @@ export class MeasureTool implements Tool {
     this.scene.request();
     const [from, to] = this.places;
     if (to === undefined) announce("First place set.");
-    else announce(inWords(measured(from.toArray(), to.toArray())).map((pair) => pair.join(" ")).join(", "));
+    else announce(measured(from, to).map((pair) => pair.join(" ")).join(", "));
   }
 
   private write([from, to]: readonly Vector3[]): void {
@@ -109,7 +109,7 @@ export class MeasureTool implements Tool {
       this.card.replaceChildren(el("p", {}, hint, el("span", { class: "hint" }, " · Esc ends")));
       return;
     }
-    this.card.replaceChildren(facts({}, ...inWords(measured(from.toArray(), to.toArray()))));
+    this.card.replaceChildren(facts({}, ...measured(from, to)));
   }
 
   private underCross(): Vector3 | null {
@@ -137,4 +137,17 @@ export class MeasureTool implements Tool {
 
 function held(share: number): number {
   return Math.min(Math.max(share, 0), 1);
+}
+
+/** Distances between two places in metres, and the angle of the line above the horizontal. */
+export function measured(from: Vector3, to: Vector3): [string, string][] {
+  const horizontal = Math.hypot(to.x - from.x, to.y - from.y);
+  const height = to.z - from.z;
+  const sign = height > 0.005 ? "+" : "";
+  return [
+    ["Horizontal distance", measure(horizontal, 2, "m")],
+    ["Height difference", sign + measure(height, 2, "m")],
+    ["Slope distance", measure(from.distanceTo(to), 2, "m")],
+    ["Inclination", measure((Math.atan2(height, horizontal) * 180) / Math.PI, 1, "°")],
+  ];
 }
