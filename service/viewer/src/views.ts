@@ -24,7 +24,9 @@ export function showView(place: HTMLElement, address: Address): View {
     place.replaceChildren(el("p", { class: "loading" }, "Loading…"));
     VIEWS[address.name]?.().then(
       (show) => {
-        if (!isLeft) shown = show(place, now);
+        if (isLeft) return;
+        shown = show(place, now);
+        shown.follow(now);
       },
       () => {
         // the file of the view was not sent

@@ -220,7 +220,8 @@ describe("two runs side by side", () => {
   test("are not reported as a fault when others are chosen while they load", async () => {
     const held = service.hold("GET jobs/1/results/report");
     location.hash = two;
-    const view = showChanges(place, partsOf(two));
+    const view = showChanges(place);
+    view.follow(partsOf(two));
     leave = () => view.leave();
     await settled();
     view.follow(partsOf(hashOf(["changes"], { old: "2", new: "3" })));
@@ -232,7 +233,8 @@ describe("two runs side by side", () => {
 
   test("fly to a building of the list after a click on the chosen model", async () => {
     location.hash = two;
-    const view = showChanges(place, partsOf(two));
+    const view = showChanges(place);
+    view.follow(partsOf(two));
     leave = () => view.leave();
     await settled();
     const follow = (): void => view.follow(partsOf(location.hash));

@@ -2,6 +2,7 @@
 import { afterEach, beforeEach, expect, test, vi } from "vitest";
 import { showHistory } from "../src/jobs/history";
 import { partsOf } from "../src/page/address";
+import type { Show, View } from "../src/page/view";
 import { showSchedules } from "../src/service/schedules_view";
 import { showWebhooks } from "../src/service/webhooks_view";
 import { FakeService, press, settled } from "./fake_service";
@@ -20,6 +21,12 @@ afterEach(() => {
   vi.useRealTimers();
   vi.unstubAllGlobals();
 });
+
+function opened(show: Show, hash: string): View {
+  const view = show(place, partsOf(hash));
+  view.follow(partsOf(hash));
+  return view;
+}
 
 const SCHEDULE = { scheduleID: "s", title: "nightly", cron: "0 2 * * *", timeZone: "UTC", state: "active", processID: "echo", nextTimes: [], counts: {}, version: 1 };
 const JOBS = "GET jobs?limit=25&offset=0";
@@ -44,7 +51,7 @@ const VIEWS = [
     action: "PATCH schedules/s",
     open: () => {
       service.on("GET schedules?limit=25&offset=0", { schedules: [SCHEDULE], links: [] });
-      return showSchedules(place, partsOf("#/schedules"));
+      return opened(showSchedules, "#/schedules");
     },
     act: () => choose("nightly", "Pause"),
   },
@@ -55,7 +62,7 @@ const VIEWS = [
     open: () => {
       service.on("GET schedules/s", SCHEDULE);
       service.on("GET schedules/s/runs?limit=25&offset=0", { runs: [], links: [] });
-      return showSchedules(place, partsOf("#/schedules/s"));
+      return opened(showSchedules, "#/schedules/s");
     },
     act: () => choose("nightly", "Pause"),
   },
@@ -65,7 +72,7 @@ const VIEWS = [
     action: "PATCH jobs/1",
     open: () => {
       service.on(JOBS, RUNNING);
-      return showHistory(place, partsOf("#/jobs"));
+      return opened(showHistory, "#/jobs");
     },
     act: () => choose("a town", "Keep it"),
   },
@@ -76,7 +83,7 @@ const VIEWS = [
     open: () => {
       service.on(LOG, { deliveries: [DELIVERY], links: [] });
       service.on(RECEIVERS, { webhooks: [RECEIVER], eventTypes: [] });
-      return showWebhooks(place, partsOf("#/webhooks"));
+      return opened(showWebhooks, "#/webhooks");
     },
     act: () => choose("ours", "Send what it missed"),
   },
@@ -86,7 +93,7 @@ const VIEWS = [
     action: "POST webhooks/deliveries/d/replay",
     open: () => {
       service.on("GET webhooks/deliveries/d", DELIVERY);
-      return showWebhooks(place, partsOf("#/webhooks/deliveries/d"));
+      return opened(showWebhooks, "#/webhooks/deliveries/d");
     },
     act: () => press("Send again"),
   },
@@ -112,7 +119,7 @@ for (const { name, reads, action, open, act } of VIEWS) {
 test("a list with a job under way is read again while the service is away, and its notice stays one", async () => {
   vi.useFakeTimers();
   service.on(JOBS, RUNNING);
-  const view = showHistory(place, partsOf("#/jobs"));
+  const view = opened(showHistory, "#/jobs");
   await vi.advanceTimersByTimeAsync(1000);
   expect(place.querySelectorAll("tbody tr")).toHaveLength(1);
   vi.stubGlobal("fetch", () => Promise.reject(new TypeError("no network")));
@@ -134,7 +141,7 @@ test("a list with a job under way is read again while the service is away, and i
 test("a view that was left is not read again by the clock", async () => {
   vi.useFakeTimers();
   service.on(JOBS, RUNNING);
-  const view = showHistory(place, partsOf("#/jobs"));
+  const view = opened(showHistory, "#/jobs");
   await vi.advanceTimersByTimeAsync(4500);
   expect(service.count(JOBS)).toBe(2);
   view.leave();

@@ -37,11 +37,7 @@ interface Loaded {
   batches: Batch[];
 }
 
-export function showChanges(place: HTMLElement, address: Address): View {
-  const view = new Changes(place);
-  view.follow(address);
-  return view;
-}
+export const showChanges = (place: HTMLElement): View => new Changes(place);
 
 class Changes implements View {
   private calledOff = new AbortController();

@@ -208,23 +208,13 @@ export function stripWidth(points: Points, section: Section): number {
   return [0.5, 1, 2].find((halfWidthM) => strip(points, section, halfWidthM).length >= 60) ?? 2;
 }
 
-export interface Histogram {
-  /** Width of a bin, metres. */
-  binM: number;
-  /** Counts from `-reachM` upward; residuals beyond are counted apart. */
-  counts: number[];
-  reachM: number;
-  below: number;
-  above: number;
-  /** Points with a roof. */
-  total: number;
-  /** Points without. */
-  uncovered: number;
-}
-
-export function histogram(residuals: Float64Array, binM = 0.05, reachM = 0.6): Histogram {
+/**
+ * The residuals in bins of `binM` metres from `-reachM` upward. Those beyond them (`below`, `above`) and points without a
+ * roof (`uncovered`) are counted apart; `total` are those with one.
+ */
+export function histogram(residuals: Float64Array, binM = 0.05, reachM = 0.6) {
   const counts = new Array<number>(Math.round((2 * reachM) / binM)).fill(0);
-  const found: Histogram = { binM, counts, reachM, below: 0, above: 0, total: 0, uncovered: 0 };
+  const found = { binM, counts, reachM, below: 0, above: 0, total: 0, uncovered: 0 };
   for (const residual of residuals) {
     if (Number.isNaN(residual)) {
       found.uncovered++;

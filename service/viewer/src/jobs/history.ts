@@ -15,11 +15,7 @@ import { durationWords, PROCESS_WORDS, processWords, resultWords, STATUS_WORDS, 
 
 const PAUSE_MS = 300; // in typing, before the search begins
 
-export function showHistory(place: HTMLElement, address: Address): View {
-  const view = new History(place);
-  view.follow(address);
-  return view;
-}
+export const showHistory = (place: HTMLElement): View => new History(place);
 
 class History extends WatchedList<StatusInfo> {
   protected readonly columns: Column<StatusInfo>[] = [

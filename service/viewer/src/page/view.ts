@@ -14,4 +14,5 @@ export interface View {
   leave(): void;
 }
 
+/** Shows what an address names, once the view follows it. */
 export type Show = (place: HTMLElement, address: Address) => View;

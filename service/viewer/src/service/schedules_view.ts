@@ -23,9 +23,7 @@ const REFRESH_MS = 10_000;
 export function showSchedules(place: HTMLElement, address: Address): View {
   const [id] = address.rest;
   if (id === "new") return showNewSchedule(place, address);
-  const view = id === undefined ? new ScheduleList(place) : new ScheduleView(place, id);
-  view.follow(address);
-  return view;
+  return id === undefined ? new ScheduleList(place) : new ScheduleView(place, id);
 }
 
 /** A menu of all that can be done with a schedule. */

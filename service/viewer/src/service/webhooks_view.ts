@@ -18,11 +18,8 @@ import { deliveryChip, DELIVERY_WORDS, DeliveryView, receiverState, unsentWords 
 
 const REFRESH_MS = 4000;
 
-export function showWebhooks(place: HTMLElement, address: Address): View {
-  const [part, id] = address.rest;
-  const view = part === "deliveries" && id !== undefined ? new DeliveryView(place, id) : new Webhooks(place);
-  view.follow(address);
-  return view;
+export function showWebhooks(place: HTMLElement, { rest: [part, id] }: Address): View {
+  return part === "deliveries" && id !== undefined ? new DeliveryView(place, id) : new Webhooks(place);
 }
 
 const nameOf = ({ description, url }: Webhook): string => description ?? url;
