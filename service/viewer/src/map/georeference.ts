@@ -78,42 +78,38 @@ function fitted(from: readonly Point[], to: readonly Point[], curved: boolean): 
     return curved ? [1, u, v, u * u, u * v, v * v] : [1, u, v];
   };
   const rows = from.map(terms);
-  const n = rows[0].length;
-  const normal = Array.from({ length: n }, (_, i) => Array.from({ length: n }, (__, j) => rows.reduce((sum, row) => sum + row[i] * row[j], 0)));
-  const both = [0, 1].map((axis) => {
-    const right = Array.from({ length: n }, (_, i) => rows.reduce((sum, row, k) => sum + row[i] * (to[k][axis] - target[axis]), 0));
-    return solved(normal, right);
+  const sums = rows[0].map((_, i) => {
+    const left = rows[0].map((__, j) => sum(rows.map((row) => row[i] * row[j])));
+    const right = ([0, 1] as const).map((axis) => sum(rows.map((row, k) => row[i] * (to[k][axis] - target[axis]))));
+    return [...left, ...right];
   });
-  const [first, second] = both;
-  if (first === null || second === null) return null;
+  const factors = solved(sums);
+  if (factors === null) return null;
   return (place) => {
     const found = terms(place);
-    return [
-      target[0] + found.reduce((sum, term, i) => sum + term * first[i], 0),
-      target[1] + found.reduce((sum, term, i) => sum + term * second[i], 0),
-    ];
+    const shifted = (axis: 0 | 1): number => target[axis] + sum(found.map((term, i) => term * factors[i][axis]));
+    return [shifted(0), shifted(1)];
   };
 }
 
-function mean(places: readonly Point[], axis: 0 | 1): number {
-  return places.reduce((sum, place) => sum + place[axis], 0) / places.length;
-}
+const sum = (values: readonly number[]): number => values.reduce((a, b) => a + b, 0);
 
-/** Gaussian elimination with pivots; null if the matrix is singular. */
-function solved(matrix: readonly (readonly number[])[], right: readonly number[]): number[] | null {
-  const rows = matrix.map((row, i) => [...row, right[i]]);
+const mean = (places: readonly Point[], axis: 0 | 1): number => sum(places.map((place) => place[axis])) / places.length;
+
+/** Gaussian elimination with pivots, of a square matrix beside its right sides; null if it is singular. */
+function solved(rows: number[][]): number[][] | null {
   const n = rows.length;
-  const largest = Math.max(...matrix.flat().map(Math.abs));
+  const largest = Math.max(...rows.flatMap((row) => row.slice(0, n)).map(Math.abs));
   for (let column = 0; column < n; column++) {
     let pivot = column;
     for (let row = column + 1; row < n; row++) if (Math.abs(rows[row][column]) > Math.abs(rows[pivot][column])) pivot = row;
     if (Math.abs(rows[pivot][column]) < 1e-10 * largest) return null;
     [rows[column], rows[pivot]] = [rows[pivot], rows[column]];
-    for (let row = 0; row < n; row++) {
-      if (row === column) continue;
-      const factor = rows[row][column] / rows[column][column];
-      for (let k = column; k <= n; k++) rows[row][k] -= factor * rows[column][k];
+    for (const row of rows) {
+      if (row === rows[column]) continue;
+      const factor = row[column] / rows[column][column];
+      row.forEach((_, k) => (row[k] -= factor * rows[column][k]));
     }
   }
-  return rows.map((row, i) => row[n] / row[i]);
+  return rows.map((row, i) => row.slice(n).map((value) => value / row[i]));
 }
