@@ -10,9 +10,8 @@ from urllib.parse import urljoin
 import finished_runs as runs
 import numpy as np
 import pytest
+from points_glb import read_points_glb
 from starlette.testclient import TestClient
-
-from pipeline.extras.octree.point_glb import read_points_glb
 
 GABLE = runs.ident("gable")
 
