@@ -16,8 +16,9 @@ from pipeline.errors import SettingsError
 from pipeline.schedule import Cron, Outcome, Rules, decided_by, enter, look, miss_passed
 from service.deliveries import Delivery
 from service.errors import ChangedMeanwhileError, TooManySchedulesError
-from service.jobs import UNLIMITED, Job, QueueLimits
+from service.jobs import Job
 from service.schedules import Definition, Schedule, ScheduleRun
+from service.settings import UNLIMITED, QueueLimits
 from service.store import queries, schedules, ticks
 from service.store.database import LOCK_SUBMISSIONS, StorePart, lock
 from service.store.records import from_row, storable

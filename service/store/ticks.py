@@ -14,9 +14,9 @@ from sqlalchemy.engine import Connection
 from pipeline.errors import SettingsError
 from pipeline.schedule import PUT_BACK, Entry, Outcome, ScheduleState, decided_by, enter, look
 from service.errors import ForbiddenError, ScheduleBusyError, ServiceError
-from service.jobs import QueueLimits
 from service.keys import Key
 from service.schedules import Schedule, ScheduleRun, Trigger
+from service.settings import QueueLimits
 from service.store import schedules
 from service.store.records import from_row
 from service.store.slot_book import SlotBook

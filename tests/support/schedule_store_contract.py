@@ -33,9 +33,10 @@ from service.errors import (
     TooManySchedulesError,
     UploadInUseError,
 )
-from service.jobs import Job, JobStatus, QueueLimits
+from service.jobs import Job, JobStatus
 from service.keys import Scope, new_key
 from service.schedules import Definition, Schedule, ScheduleRun, Trigger
+from service.settings import QueueLimits
 from service.store import JobFilter, JobStore, ScheduleFilter, schedules
 from service.store.schedules import COLUMN_OF
 from service.store.slot_book import MAX_KEPT, SlotBook
