@@ -34,8 +34,9 @@ from benchmarks.entries import markdown_table
 from pipeline.io import ReadOptions
 from pipeline.runtime import run as run_module
 from pipeline.runtime.cluster.local_executor import LocalExecutor
+from pipeline.runtime.cluster.packed_tasks import pack_tasks
 from pipeline.runtime.cluster.serial_executor import SerialExecutor
-from pipeline.runtime.monitoring.measurement import Measured, Result, Task, pack_tasks, peak_of_process
+from pipeline.runtime.monitoring.measurement import Measured, Result, Task, peak_of_process
 from pipeline.runtime.monitoring.progress import Event, Watch, ignore
 from pipeline.runtime.plan import Plan, make_plan, tiles_per_block
 from pipeline.runtime.request import RunRequest

@@ -15,7 +15,7 @@ from pathlib import PurePath
 import numpy as np
 import shapely
 
-from pipeline.building.drawing import Building, blocks, own_model
+from pipeline.building.drawing import Building, own_model
 from pipeline.building.form_search import first_valid, judged, too_few_points, withdraw
 from pipeline.building.record import delivered, failed_building, record_of
 from pipeline.errors import BuildingError
@@ -129,6 +129,8 @@ def _reconstruct(
         fallback = error
     except shapely.errors.GEOSException as error:
         fallback = BuildingError(Reason.NO_PARTITION, f"the plan cannot be drawn: {error}")
+    from pipeline.building.blocks import blocks
+
     block, _ = first_valid(blocks(building, plan), building)
     if block is None:
         raise BuildingError(Reason.NO_FOOTPRINT, f"no valid block over {len(building.roof.points)} roof points")

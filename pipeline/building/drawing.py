@@ -4,27 +4,20 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator
-from functools import partial
 
 import numpy as np
-import shapely
-from shapely import MultiPolygon
 
 from pipeline.methods import ReconstructSettings
 from pipeline.model import Candidate, Decision, Doubt, Plane, RoofType, Segmentation
 from pipeline.quality.validity import check_solid
 from pipeline.registry import extra
-from pipeline.roof.block import block_forms, block_plane
-from pipeline.roof.floor_cut import cut_at_floor
-from pipeline.roof.footprint import hull_of_points, outline
 from pipeline.roof.forms import FaceForm
-from pipeline.roof.named_form import BLOCK, NamedForm, RankedFaces
+from pipeline.roof.named_form import RankedFaces
 from pipeline.roof.partition import RoofPartition
-from pipeline.roof.plan import RoofPlan, RoofPoints, partition_roof
+from pipeline.roof.plan import RoofPoints
 from pipeline.roof.solid import LodParts, SolidPart, solid_parts
 from pipeline.roof.unlike_points import contradiction_of
-from pipeline.roof.unsupported_faces import goes_far, level_unsupported_faces, levelled_share_of
+from pipeline.roof.unsupported_faces import cut_at_floor, goes_far, level_unsupported_faces, levelled_share_of
 
 _MUCH_LEVELLED = 0.05
 """Share of the plan. Where faces of more than this had to be made level, other forms are drawn and compared with it."""
@@ -135,30 +128,3 @@ def large_parts(parts: list[SolidPart], min_area_m2: float) -> list[SolidPart]:
     """The parts that are large enough, or the largest one."""
     large = [part for part in parts if part.footprint.area >= min_area_m2]
     return large or sorted(parts, key=lambda part: -part.footprint.area)[:1]
-
-
-def blocks(building: Building, plan: RoofPlan | None) -> Iterator[NamedForm[DrawnModel]]:
-    """Blocks on the footprint, else on the partition's outline; behind them those on the points' outline."""
-    roof, settings, ground_z_m = building.roof, building.settings.roof, building.candidate.ground_z_m
-    plane = block_plane(roof.points, ground_z_m, settings.block_height_percentile)
-    if plan is None and roof.footprint_mm is not None:
-        outlines = [("the footprint", roof.footprint_mm)]
-    else:
-        if plan is None:
-            unlabelled = dataclasses.replace(roof, labels=np.zeros(len(roof.points), np.int32))
-            plan = partition_roof(unlabelled, [plane], settings)
-        outlines = [("the outline", plan.outline_mm)]
-        if plan.raw is not None:
-            outlines.append(("the raw outline", outline(plan.raw)))
-    hull = hull_of_points(roof.points)
-    if hull is not None:
-        outlines.append(("the points' hull", MultiPolygon([shapely.transform(hull, lambda xy: np.rint(xy * 1e3))])))
-    tolerance_m, least_m2 = settings.simplification_spacings * roof.spacing_m, settings.min_part_area_m2
-    for words, footprint in outlines:
-        for form in block_forms(footprint, plane, ground_z_m, tolerance_m, least_m2):
-            yield NamedForm(BLOCK, partial(block_model, form, plane), f"on {words}")
-
-
-def block_model(form: Callable[[], list[SolidPart]], plane: Plane) -> DrawnModel:
-    """The block that a form draws."""
-    return DrawnModel(lod="1.2", parts=form(), planes=[plane])

@@ -1,4 +1,4 @@
-"""The search for a form of the roof whose solids are valid."""
+"""The search for a form of the roof whose solids are valid, and whether its model is `ok`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from pipeline.building.drawing import Building, DrawnModel, blocks
+from pipeline.building.drawing import Building, DrawnModel
 from pipeline.building.record import record_of
 from pipeline.errors import BuildingError
 from pipeline.methods import LODS
@@ -140,6 +140,8 @@ def judged(building: Building, record: BuildingResult, plan: RoofPlan | None, mo
         return record
     if not is_finest or doubt.reason in NOT_OF_FORM:
         return record.doubted(doubt)
+    from pipeline.building.blocks import blocks
+
     withdraw(building)
     block, _ = first_valid(blocks(building, plan), building)
     if block is not None:

@@ -32,9 +32,7 @@ from numba.core.targetconfig import ConfigStack
 from numba.core.typing import templates
 
 from pipeline.compiler import store
-from pipeline.compiler.frame_room import with_room_for_frames
-from pipeline.compiler.processor import PORTABLE, processor
-from pipeline.compiler.store import Stored
+from pipeline.compiler.store import PORTABLE, Stored, processor
 
 types: Any = numba.types
 KNOWN = ("0.68.",)
@@ -376,6 +374,8 @@ class KernelDispatcher(registry.CPUDispatcher):
         if known is not None:
             result = self._with_wrapper(known)
         else:
+            from pipeline.compiler.frame_room import with_room_for_frames
+
             store.warn_of_misfits(self._prefix)
             compiling = functools.partial(self._compiled, arguments)
             result = compiling() if _DEPTH.value else with_room_for_frames(compiling)

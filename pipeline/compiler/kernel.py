@@ -15,7 +15,7 @@ from typing import Any, Literal, TypeVar, overload
 
 from pipeline.compiler import store
 from pipeline.compiler.fingerprint import Kerneled, fingerprint
-from pipeline.compiler.processor import processor
+from pipeline.compiler.store import processor
 
 
 class Kernel:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.errors import InputError, UnreadableInputError, all_at_fault
-from pipeline.io.formats import files_in, first_bytes, is_index
+from pipeline.io.formats import first_bytes, is_index
 from pipeline.io.locations import is_url, shown
 from pipeline.registry import extra
 
@@ -81,6 +81,8 @@ def _files_of(entry: str | Path, cut: Cut) -> list[str]:
         return files
     path = Path(entry)
     if path.is_dir():
+        from pipeline.io.point_folders import files_in
+
         return [str(file) for file in files_in(path)]
     if not path.exists() and glob.has_magic(str(entry)):
         met = glob.glob(str(entry), recursive=True)  # noqa: PTH207 - pathlib knows no absolute patterns

@@ -7,14 +7,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pipeline.io.locations import is_url
 from pipeline.io.records import Readable
 from pipeline.io.storage import LocalStorage, Storage
-from pipeline.io.temporary import temporary_folder
+from pipeline.registry import extra
 
 if TYPE_CHECKING:
     import pyarrow.fs as pafs
-from pipeline.io.locations import is_url
-from pipeline.registry import extra
 
 
 def storage_at(place: str | Path) -> Storage:
@@ -46,6 +45,8 @@ def on_this_machine(location: str | Path) -> Iterator[Path]:
     if not is_url(location):
         yield Path(location)
         return
+    from pipeline.io.temporary import temporary_folder
+
     file = extra("RemoteFile")(str(location))
     with temporary_folder() as folder:
         path = folder / f"file{file.suffix}"
@@ -62,6 +63,8 @@ def made_here(place: str) -> Iterator[str]:
     if not is_url(place):
         yield place
         return
+    from pipeline.io.temporary import temporary_folder
+
     storage = storage_at(place)
     with temporary_folder() as folder:
         yield str(folder)

@@ -13,7 +13,8 @@ from shapely.geometry.base import BaseGeometry
 
 from pipeline.errors import BuildingError
 from pipeline.model import FloatArray, Plane, Reason
-from pipeline.roof.footprint import polygons_of, without_repeated
+from pipeline.roof.footprint import polygons_of
+from pipeline.roof.footprint_in_mm import without_repeated
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.solid import SolidPart, solid_parts
 

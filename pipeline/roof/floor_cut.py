@@ -1,7 +1,7 @@
-"""Roof faces that leave the heights in which a roof may lie end there: each is cut along a level line.
+"""Cuts roof faces that leave the permitted range of heights, each along a level line.
 
-The sloping part keeps its plane, what is beyond the line is level, and the neighbours get the ends of the cut, so the
-faces still share their borders.
+The sloping part keeps its plane, the part beyond the line becomes level, and the neighbours get the ends of the cut, so
+the faces still share their borders.
 """
 
 from __future__ import annotations
@@ -13,29 +13,14 @@ from itertools import pairwise
 import numpy as np
 import shapely
 
-from pipeline.model import FloatArray, Plane
+from pipeline.model import Plane
 from pipeline.roof.partition import RoofPartition
 
 _NEAR_MM = 5.0
 """A cut that would end nearer to a corner than this ends there; numerical guard."""
-_SMALL_DIP_M = 0.04
-"""Faces may dip so far below the least elevation: less than the least `min_clearance_m`, so they stay above ground."""
 
 Corner = tuple[int, int]
 Ring = list[Corner]
-
-
-def cut_at_floor(
-    partition: RoofPartition, planes: Sequence[Plane], floor_z_m: float
-) -> tuple[RoofPartition, list[Plane]]:
-    """Cut every face that dips below the elevation `floor_z_m`, and make the part below level at that elevation.
-
-    Returns the partition and the planes, the level one last where any face was cut. A face whose cut does not divide it
-    into polygons becomes level as a whole. Without such faces the same partition comes back.
-    """
-    lowest = _lowest_m(partition, planes)
-    dips = np.flatnonzero(lowest < floor_z_m - _SMALL_DIP_M).tolist()
-    return cut_at_levels(partition, planes, dict.fromkeys(dips, floor_z_m), above=False, undivided=True)
 
 
 def cut_at_levels(
@@ -44,11 +29,8 @@ def cut_at_levels(
     """Cut faces, by number, at an elevation, and make what lies above it, or else below it, level there.
 
     Returns the partition and the planes; the level ones come last, one for each elevation. A face whose cut does not
-    divide it into polygons becomes level as a whole if `undivided`, else it stays. Without faces to cut the same
-    partition comes back.
+    divide it into polygons becomes level as a whole if `undivided`, else it stays.
     """
-    if not levels_m:
-        return partition, list(planes)
     faces = [_rings(polygon) for polygon in partition.polygons]
     cut = {k: _ends_of_cut(faces[k], planes[int(partition.labels[k])], z) for k, z in levels_m.items()}
     heights = sorted({round(z, 3) for z in levels_m.values()})
@@ -73,15 +55,6 @@ def cut_at_levels(
             labels.append(number[round(levels_m[k], 3)] if is_level else label)
     level = [Plane(a=0.0, b=0.0, c=z, n_points=0, rmse_m=0.0) for z in heights]
     return RoofPartition(polygons=tuple(polygons), labels=np.array(labels, np.int32)), [*planes, *level]
-
-
-def _lowest_m(partition: RoofPartition, planes: Sequence[Plane]) -> FloatArray:
-    """Elevation of the lowest corner of every face, (p,)."""
-    xy, face = shapely.get_coordinates(np.array(partition.polygons, object), return_index=True)
-    a, b, c = np.array([plane.coefficients for plane in planes]).reshape(len(planes), 3)[partition.labels[face]].T
-    z: FloatArray = a * (xy[:, 0] * 1e-3) + b * (xy[:, 1] * 1e-3) + c
-    lowest: FloatArray = np.minimum.reduceat(z, np.searchsorted(face, np.arange(len(partition.labels))))
-    return lowest
 
 
 def _rings(polygon: shapely.Polygon) -> list[Ring]:

@@ -1,4 +1,4 @@
-"""The forms that the roof faces of a building can take, the most wanted first.
+"""The forms that the roof faces of a building can take, the preferred one first.
 
 A form is a function that draws the faces when it is called: a later one costs nothing where an earlier one is valid.
 """
@@ -15,7 +15,6 @@ from shapely import MultiPolygon
 from pipeline.errors import BuildingError
 from pipeline.model import Decision, DecisionKind, Outcome, Plane
 from pipeline.registry import extra
-from pipeline.roof.footprint import simpler_outlines
 from pipeline.roof.named_form import ARRANGEMENT, MOST_TEMPLATE_POINTS, SIMPLER, TEMPLATES, NamedForm, RankedFaces
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.plan import RoofPoints, arranged_faces, drawn_outline, partition_roof
@@ -58,6 +57,8 @@ def arranged_forms(
         wider = partial(arranged_faces, roof, planes, outline_mm, costs, clearance)
         yield NamedForm(ARRANGEMENT, wider, f"vertices {clearance:g} times as far apart")
     if roof.footprint_mm is not None:
+        from pipeline.roof.footprint_in_mm import simpler_outlines
+
         for simpler in simpler_outlines(outline_mm):
             yield from _competing_forms(roof, planes, simpler, settings, costs, decisions, SIMPLER)[0]
     try:
@@ -85,6 +86,8 @@ def template_forms(roof: RoofPoints, lack: BuildingError, settings: RoofSettings
         raise lack from None
     yield NamedForm(TEMPLATES, templates.faces)
     if roof.footprint_mm is not None:
+        from pipeline.roof.footprint_in_mm import simpler_outlines
+
         for simpler in simpler_outlines(outline_mm):
             with contextlib.suppress(*UNDRAWABLE):
                 yield NamedForm(TEMPLATES, fit_templates(roof.points, simpler).faces, SIMPLER)

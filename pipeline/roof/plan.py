@@ -13,8 +13,7 @@ from shapely import MultiPolygon, Polygon
 
 from pipeline.compiler import kernel
 from pipeline.errors import BuildingError
-from pipeline.geometry import spacing_over_area_m
-from pipeline.kernels.bounds import bounds_of
+from pipeline.geometry import bounds_of, spacing_over_area_m
 from pipeline.model import (
     BoolArray,
     Candidate,
@@ -33,8 +32,8 @@ from pipeline.roof.arrangement.arranging import arrange
 from pipeline.roof.arrangement.guide_lines import NO_GUIDES, Guides
 from pipeline.roof.eaves import straighten
 from pipeline.roof.edge_position import EdgePoints, mixed_pulse_reach_mm
-from pipeline.roof.footprint import footprint_in_mm, in_footprint, outline
-from pipeline.roof.labelling import continue_crossings, empty_samples, fill_labels, nearest_points
+from pipeline.roof.footprint import outline
+from pipeline.roof.labelling import continue_crossings, empty_samples, fill_labels
 from pipeline.roof.partition import OUTSIDE, MinAreas, RoofPartition, absorb_small_regions, march
 from pipeline.roof.settings import ArrangementSettings, RoofSettings
 from pipeline.tin.delaunay import triangulate
@@ -87,7 +86,7 @@ class RoofPoints:
             labels=np.zeros(0, np.int32),
             split=np.zeros(0, np.bool_),
             spacing_m=math.nan,
-            footprint_mm=None if footprint is None else footprint_in_mm(footprint),
+            footprint_mm=_in_mm(footprint),
         )
 
 
@@ -110,7 +109,6 @@ def roof_points(cloud: PreparedCloud, settings: RoofSettings, decisions: list[De
         decisions.append(Decision.check("roof_points", len(index), fewest))
     if len(index) < fewest:
         raise BuildingError(Reason.TOO_FEW_POINTS, f"{len(index)} roof points, fewer than {name} = {fewest}")
-    footprint = None if candidate.footprint is None else footprint_in_mm(candidate.footprint)
     xy_mm = cloud.points_mm.take(index, axis=0)[:, :2] + (cloud.shift_m[:2] * 1e3).astype(np.int64)
     return RoofPoints(
         points=points,
@@ -119,10 +117,19 @@ def roof_points(cloud: PreparedCloud, settings: RoofSettings, decisions: list[De
         labels=np.full(len(index), -1, np.int32),
         split=_are_among(xy_mm, candidate.split_returns),
         spacing_m=min(max(spacing_over_area_m(points), 0.1), 3.0),
-        footprint_mm=footprint,
-        outline_mm=None if candidate.outline is None else footprint_in_mm(candidate.outline),
+        footprint_mm=_in_mm(candidate.footprint),
+        outline_mm=_in_mm(candidate.outline),
         facades=_facades(candidate, points) if settings.at_walls or settings.finds_walls else None,
     )
+
+
+def _in_mm(footprint: Polygon | MultiPolygon | None) -> MultiPolygon | None:
+    """A given or drawn footprint in integer millimetres."""
+    if footprint is None:
+        return None
+    from pipeline.roof.footprint_in_mm import footprint_in_mm
+
+    return footprint_in_mm(footprint)
 
 
 def _facades(candidate: Candidate, points: FloatArray) -> FacadePoints:
@@ -202,6 +209,9 @@ def _traced_plan(roof: RoofPoints, planes: Sequence[Plane], settings: RoofSettin
     if given is None:
         counted[: n + m] = 1
     else:
+        from pipeline.roof.footprint_in_mm import in_footprint
+        from pipeline.roof.nearest_points import nearest_points
+
         counted[: n + m] = in_footprint(given, xy_mm[: n + m])
         # beyond the footprint the faces go on, within it they close gaps that are not too wide
         nearest, distance_m = nearest_points(roof.xy_mm, samples)
@@ -223,6 +233,8 @@ def _traced_plan(roof: RoofPoints, planes: Sequence[Plane], settings: RoofSettin
         return RoofPlan(planes=tuple(planes), faces=partition, outline_mm=around, raw=partition)
     faces = partition
     if continued:
+        from pipeline.roof.nearest_points import nearest_points
+
         labels[:n] = fill_labels(roof.xy_mm, labels[:n])
         outside = np.flatnonzero(labels[n : n + m] < 0)
         nearest, _ = nearest_points(roof.xy_mm, samples[outside])
@@ -259,6 +271,8 @@ def walls_of(footprint: Polygon | MultiPolygon, roof: RoofPoints, settings: Roof
     """The walls beneath a footprint at the eaves, local metres; None where they are not asked for."""
     if roof.facades is None or roof.footprint_mm is not None or not settings.finds_walls:
         return None
+    from pipeline.roof.footprint_in_mm import footprint_in_mm
+
     eaves_mm = footprint_in_mm(footprint)
     reach_mm = mixed_pulse_reach_mm(eaves_mm, EdgePoints.of(roof.xy_mm, roof.split, roof.spacing_m))
     walls: Walls | None = extra("walls_beneath")(

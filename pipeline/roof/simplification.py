@@ -11,7 +11,7 @@ import shapely
 
 from pipeline.errors import BuildingError
 from pipeline.model import FloatArray, Reason
-from pipeline.roof.footprint import without_repeated
+from pipeline.roof.footprint_in_mm import without_repeated
 from pipeline.roof.partition import RoofPartition
 
 _STRAIGHT_MM = 2.0

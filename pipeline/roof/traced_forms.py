@@ -1,4 +1,4 @@
-"""Roof faces whose borders are traced between labelled points: ways to draw them, the wanted one first."""
+"""Roof faces whose borders are traced between labelled points: ways to draw them, the preferred one first."""
 
 from __future__ import annotations
 
@@ -6,11 +6,15 @@ import dataclasses
 from collections.abc import Iterator
 from functools import partial
 
+import numpy as np
 import shapely
-from shapely import MultiPolygon
+from shapely import MultiPolygon, Polygon
 
+from pipeline.errors import BuildingError
+from pipeline.model import Reason
 from pipeline.roof.borders import straighten_borders
-from pipeline.roof.footprint import clip_partition, polygons_of, simpler_outlines
+from pipeline.roof.footprint import polygons_of
+from pipeline.roof.footprint_in_mm import simpler_outlines
 from pipeline.roof.named_form import SIMPLER, TRACED, NamedForm
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.plan import RoofPlan, RoofPoints, min_face_area
@@ -96,3 +100,50 @@ def traced_forms(plan: RoofPlan, roof: RoofPoints, settings: RoofSettings) -> It
             simpler_plan = dataclasses.replace(plan, outline_mm=simpler)
             for form in plan_forms(simpler_plan, roof, settings):
                 yield dataclasses.replace(form, detail=f"{form.detail}, {SIMPLER}")
+
+
+def clip_partition(partition: RoofPartition, footprint_mm: MultiPolygon, min_area_m2: float) -> RoofPartition:
+    """The part of a partition inside a footprint in integer millimetres.
+
+    The partition reaches beyond it wherever there is roof. Pieces below `min_area_m2` join the neighbour with the
+    longest border, or go where they have none. Raises BuildingError `no_partition` where nothing is left.
+    """
+    shapely.prepare(footprint_mm)
+    polygons = np.array(partition.polygons, dtype=object)
+    inside = shapely.contains_properly(footprint_mm, polygons)
+    pieces: list[Polygon] = []
+    labels: list[int] = []
+    for polygon, label, whole in zip(polygons, partition.labels.tolist(), inside, strict=True):
+        for piece in [polygon] if whole else polygons_of(shapely.intersection(polygon, footprint_mm, grid_size=1.0)):
+            pieces.append(piece)
+            labels.append(label)
+    pieces, labels = _absorb_small(pieces, labels, min_area_m2 * 1e6)
+    if not pieces:
+        raise BuildingError(Reason.NO_PARTITION, "no roof face lies inside the footprint")
+    return RoofPartition(polygons=tuple(pieces), labels=np.array(labels, np.int32))
+
+
+def _absorb_small(pieces: list[Polygon], labels: list[int], min_area_mm2: float) -> tuple[list[Polygon], list[int]]:
+    """Unite pieces that are too small with a neighbour, smallest first."""
+    alive = [True] * len(pieces)
+    small = [k for k in range(len(pieces)) if pieces[k].area < min_area_mm2]
+    if not small:
+        return pieces, labels
+    tree = shapely.STRtree(pieces)
+    for k in sorted(small, key=lambda k: (pieces[k].area, k)):
+        if pieces[k].area >= min_area_mm2:
+            continue
+        longest, into = 0.0, -1
+        for j in sorted(tree.query(pieces[k]).tolist()):
+            if j == k or not alive[j]:
+                continue
+            border = shapely.intersection(pieces[k], pieces[j], grid_size=1.0).length
+            if border > longest:
+                longest, into = border, j
+        alive[k] = False
+        if into >= 0:
+            united = shapely.union(pieces[k], pieces[into], grid_size=1.0)
+            if isinstance(united, Polygon):
+                pieces[into] = united
+    kept = [k for k in range(len(pieces)) if alive[k]]
+    return [pieces[k] for k in kept], [labels[k] for k in kept]

@@ -1,15 +1,14 @@
-"""Roof faces that go on where no point is: they end at the heights that the points show.
+"""Roof faces that continue beyond their points: they end at the heights that the points show.
 
-A plane says little beyond its last points. Up its slope it may go on by its noise and by its rise over two point
-spacings, the farthest that a ridge lies from its points; what would lie above is level. Down its slope it may go on
-for longer, since an eave that something hides is often there. A face without any point of its own, or under the floor,
-is level as a whole.
+A plane says little beyond its last points. Up its slope it may continue by its noise plus its rise over two point
+spacings, the farthest that a ridge lies from its points; above that it is level. Down its slope it may continue
+farther, since hidden eaves are common. A face without any point of its own, or under the floor, is level as a whole.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +16,6 @@ import shapely
 
 from pipeline.compiler import kernel
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray, Plane
-from pipeline.roof.floor_cut import cut_at_levels
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.plan import RoofPoints
 from pipeline.roof.settings import RoofSettings
@@ -89,13 +87,24 @@ def level_unsupported_faces(
         seen_m = float(found.highest[k]) + noise_of(plane)
         if ends and float(found.tops[k]) > seen_m + REACH_SPACINGS * rise_m and rise_m > 0.0:
             ceilings[k] = seen_m + rise_m
-    partition, extended = cut_at_levels(partition, extended, ceilings, above=True, undivided=False)
+    partition, extended = _cut(partition, extended, ceilings, above=True, undivided=False)
     if ends and below.any():
         found = heights_of_faces(partition, roof, extended)
         least = found.lowest - settings.max_overshoot_m
         dips = {k: float(least[k]) for k in np.flatnonzero(np.maximum(found.bottoms, floor) < least).tolist()}
-        partition, extended = cut_at_levels(partition, extended, dips, above=False, undivided=True)
+        partition, extended = _cut(partition, extended, dips, above=False, undivided=True)
     return partition, extended
+
+
+def _cut(
+    partition: RoofPartition, planes: Sequence[Plane], levels_m: Mapping[int, float], *, above: bool, undivided: bool
+) -> tuple[RoofPartition, list[Plane]]:
+    """`cut_at_levels`; the same partition without faces to cut."""
+    if not levels_m:
+        return partition, list(planes)
+    from pipeline.roof.floor_cut import cut_at_levels
+
+    return cut_at_levels(partition, planes, levels_m, above=above, undivided=undivided)
 
 
 def goes_far(
@@ -188,3 +197,29 @@ def _level_plane(polygon: shapely.Polygon, label: int, roof: RoofPoints, otherwi
     height = round(max(float(z[len(z) // 2]) if len(z) else otherwise, floor), 3)
     rmse = math.sqrt(math.fsum(((z - height) ** 2).tolist()) / len(z)) if len(z) else 0.0
     return Plane(a=0.0, b=0.0, c=height, n_points=len(z), rmse_m=rmse)
+
+
+_SMALL_DIP_M = 0.04
+"""Faces may dip so far below the least elevation: less than the least `min_clearance_m`, so they stay above ground."""
+
+
+def cut_at_floor(
+    partition: RoofPartition, planes: Sequence[Plane], floor_z_m: float
+) -> tuple[RoofPartition, list[Plane]]:
+    """Cut every face that dips below the elevation `floor_z_m`, and make the part below level at that elevation.
+
+    Returns the partition and the planes, the level one last where any face was cut. A face whose cut does not divide it
+    into polygons becomes level as a whole. Without such faces the same partition comes back.
+    """
+    lowest = _lowest_m(partition, planes)
+    dips = np.flatnonzero(lowest < floor_z_m - _SMALL_DIP_M).tolist()
+    return _cut(partition, planes, dict.fromkeys(dips, floor_z_m), above=False, undivided=True)
+
+
+def _lowest_m(partition: RoofPartition, planes: Sequence[Plane]) -> FloatArray:
+    """Elevation of the lowest corner of every face, (p,)."""
+    xy, face = shapely.get_coordinates(np.array(partition.polygons, object), return_index=True)
+    a, b, c = np.array([plane.coefficients for plane in planes]).reshape(len(planes), 3)[partition.labels[face]].T
+    z: FloatArray = a * (xy[:, 0] * 1e-3) + b * (xy[:, 1] * 1e-3) + c
+    lowest: FloatArray = np.minimum.reduceat(z, np.searchsorted(face, np.arange(len(partition.labels))))
+    return lowest

@@ -22,20 +22,18 @@ from pipeline.runtime.monitoring.progress import Listener, Progress, ignore, nev
 from pipeline.runtime.plan import Plan
 from pipeline.runtime.request import RunRequest, plan_inputs
 from pipeline.runtime.run_context import RunContext, run_context
-from pipeline.runtime.run_directory import RunDirectory, input_files
+from pipeline.runtime.run_directory import RunDirectory, about_emptiness, input_files, run_counts
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.location import check_scratch, run_scratch
 from pipeline.runtime.scratch.outcomes import Place
 from pipeline.runtime.stages.cleanup import tidy
 from pipeline.runtime.stages.content_digest import STAGE as DIGEST
 from pipeline.runtime.stages.content_digest import content_digest
-from pipeline.runtime.stages.counts import about_emptiness, run_counts
-from pipeline.runtime.stages.given_files import footprints_for, guides_for, overrides_for
 from pipeline.runtime.stages.ground import Ground, find_ground
 from pipeline.runtime.stages.ingested import Ingested
 from pipeline.runtime.stages.join import join
 from pipeline.runtime.stages.publish import Published, RunOutput, publish
-from pipeline.runtime.stages.read_inputs import read_inputs
+from pipeline.runtime.stages.read_inputs import footprints_for, guides_for, overrides_for, read_inputs
 from pipeline.runtime.stages.reconstruct import Models, models_stage, reconstruct
 from pipeline.runtime.stages.sites import Joined
 from pipeline.runtime.stages.split import Splits, split

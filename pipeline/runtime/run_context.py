@@ -16,8 +16,8 @@ from pipeline.errors import FolderLostError, RunOverError
 from pipeline.runtime.cluster.serial_executor import Executor, SerialExecutor
 from pipeline.runtime.isolation.limits import IsolationLimits
 from pipeline.runtime.monitoring.logs import about
+from pipeline.runtime.monitoring.measurement import Part
 from pipeline.runtime.monitoring.progress import TICK_S, Progress, Watch, never, span
-from pipeline.runtime.monitoring.traces import Part
 from pipeline.runtime.plan import Plan, check_memory
 from pipeline.runtime.resources import Resources
 from pipeline.runtime.scratch.folder import Scratch

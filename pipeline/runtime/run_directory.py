@@ -7,6 +7,7 @@ import dataclasses
 import datetime as dt
 import functools
 import json
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,14 +17,20 @@ from pipeline.errors import RunCancelledError, RunError
 from pipeline.export.coordinates import one_unit
 from pipeline.export.folders import POINTS_FOLDER, TERRAIN_FOLDER
 from pipeline.io import SourceInfo, SpatialReference, Storage, shown, storage_at
+from pipeline.io.source import CAUSES
+from pipeline.model import Status
 from pipeline.runtime.manifest import NAME, PAGE, InputFile, PointFileFacts, RunManifest, RunStatus, write_manifest
 from pipeline.runtime.monitoring.progress import Progress
 from pipeline.runtime.plan import Plan
 from pipeline.runtime.request import RunRequest, input_file, request_record
 from pipeline.runtime.scratch.folder_lock import locked_results
+from pipeline.runtime.stages.batch_figures import Counted
 from pipeline.runtime.stages.cleanup import publishing
-from pipeline.runtime.stages.ingested import Ingested
+from pipeline.runtime.stages.ground import Ground
+from pipeline.runtime.stages.ingested import Ingested, without_roofs
 from pipeline.runtime.stages.reconstruct import QUARANTINE
+from pipeline.runtime.stages.sites import Joined
+from pipeline.runtime.stages.split import Splits
 from pipeline.settings import RunSettings
 from pipeline.tiling import MM
 
@@ -256,3 +263,49 @@ def _crs_facts(reference: SpatialReference) -> dict[str, object]:
         "vertical_unit_assumed": reference.vertical_unit_assumed,
         "cityjson_vertical_unit_m": one_unit(reference).vertical_unit_m,
     }
+
+
+NOTHING_FOUND = "no building was found"
+"""Begins the first warning of a run without candidates."""
+
+
+def run_counts(
+    plan: Plan, ingested: Sequence[Ingested], ground: Ground, splits: Splits, joined: Joined, found: Counted
+) -> dict[str, int]:
+    """The counts in run.json."""
+    by_status = found.statuses
+    dropped: Counter[str] = Counter()
+    for entry in ingested:
+        dropped.update(entry.findings.dropped)
+    return {
+        "points_promised": plan.points,
+        "points": sum(s.points for s in splits.figures),
+        **{f"dropped_{cause}": dropped[cause] for cause in sorted(CAUSES)},
+        "duplicates": sum(cells.duplicates for cells in ground.cells.values()),
+        "outliers": sum(cells.outliers for cells in ground.cells.values()),
+        "tiles": len(splits.figures),
+        "candidates": by_status.total(),
+        **{status.value: by_status[status.value] for status in Status},
+        "rejected": sum(one.figures.count for one in joined.rejected) + found.rejected.total(),
+        "reused": by_status.total() + found.rejected.total() - found.made,
+        "small_surfaces": joined.small_fragments,
+        "roof_faces": found.faces,
+        "class_6_in_candidates": sum(s.audit[0] for s in splits.figures),
+        "other_classes_in_candidates": sum(s.audit[1] for s in splits.figures),
+        "class_6_elsewhere": sum(s.audit[2] for s in splits.figures),
+    }
+
+
+def about_emptiness(ingested: Sequence[Ingested], ground: Ground, joined: Joined, *, trust: bool) -> str:
+    """Why no building can be modelled, or that none was found; empty where some were."""
+    classes: Counter[int] = Counter()
+    for found in ingested:
+        classes.update(found.classes)
+    by_classes = without_roofs(classes, trust=trust)
+    if by_classes or joined.candidates:
+        return by_classes
+    rejected = sum(listed.figures.count for listed in joined.rejected)
+    outliers = sum(cells.outliers for cells in ground.cells.values())
+    lone = f", {outliers} of which are outliers: are they too few, or is a unit wrong" if outliers else ""
+    left = f"; {rejected} objects were rejected, each with its reason" if rejected else ""
+    return f"{NOTHING_FOUND} in {classes.total()} points{lone}{left}"

@@ -1,9 +1,9 @@
 """Roof planes whose thresholds follow the noise and the density of the points.
 
-A dense cloud is first averaged to nodes, so that the noise is small beside their distance. Of all regions that grow
-from flat seeds those are taken that explain the most (`trial_regions`). Planes that touch are one where an F-test finds
-no difference between them, and every point takes the plane near it that has the company of its neighbours. What is
-left is searched once more: dormers and other superstructures.
+A dense cloud is first averaged to nodes, so that the noise is small compared with their distance. Regions grow from
+flat seeds, and the ones that explain the most are taken (`trial_regions`). Touching planes become one if an F-test
+finds no difference between them, and every point takes the nearby plane that most of its neighbours take. The remaining
+points are searched once more, for dormers and other superstructures.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.geometry import nearest_neighbours
-from pipeline.kernels.sorting import ascending_order, in_order
+from pipeline.kernels.sorting import in_order
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
 from pipeline.segmentation.plane_regression import best_fit_plane, cluster_sums, cosine_of_slope, mean_square_residual
 from pipeline.segmentation.plane_settings import MIN_PLANE_POINTS, AdaptivePlaneSettings
@@ -85,6 +85,8 @@ def detect_planes(points: FloatArray, spacing_m: float, settings: AdaptivePlaneS
     if len(points) < MIN_PLANE_POINTS or not spacing_m > 0.0:
         return DetectedPlanes(coefficients=np.zeros((0, 3)), labels=np.full(len(points), -1, np.int32))
     if spacing_m < _DENSE_SPACING_M:
+        from pipeline.segmentation.mean_nodes import mean_nodes
+
         nodes, node_of = mean_nodes(points, _NODE_CELL_M, settings.max_distance_m)
         spacing_m = _NODE_CELL_M
     else:
@@ -113,56 +115,6 @@ class _Limits(NamedTuple):
     """Least cosine of a plane's slope."""
     normal_cosine: float
     """Least cosine between a plane and a point's own."""
-
-
-@kernel
-def mean_nodes(points: FloatArray, cell_m: float, gap_m: float) -> tuple[FloatArray, LabelArray]:
-    """Means of the points of every lattice cell, one for each stack of points that a vertical gap parts from others.
-
-    From points (n, 3), metres; gaps part them from the height `gap_m` on. Returns the nodes (m, 3), by cell in x and y,
-    in a cell the lowest first, and the node of every point, (n,) int32.
-    """
-    n = len(points)
-    row = np.empty(n, np.int64)
-    first_row, last_row = math.floor(points[0, 1] / cell_m), math.floor(points[0, 1] / cell_m)
-    for i in range(n):
-        row[i] = math.floor(points[i, 1] / cell_m)
-        first_row, last_row = min(first_row, row[i]), max(last_row, row[i])
-    cell = np.empty(n, np.int64)
-    for i in range(n):
-        cell[i] = math.floor(points[i, 0] / cell_m) * (last_row + 1 - first_row) + (row[i] - first_row)
-    order = ascending_order(cell)
-    nodes = np.zeros((n, 3))
-    node_of = np.empty(n, np.int32)
-    count = 0
-    begin = 0
-    while begin < n:
-        end = begin + 1
-        while end < n and cell[order[end]] == cell[order[begin]]:
-            i = order[end]
-            q = end
-            while q > begin and points[order[q - 1], 2] > points[i, 2]:
-                order[q] = order[q - 1]
-                q -= 1
-            order[q] = i
-            end += 1
-        held = 0
-        for q in range(begin, end):
-            i = order[q]
-            if held > 0 and points[i, 2] - points[order[q - 1], 2] > gap_m:
-                for axis in range(3):
-                    nodes[count, axis] /= held
-                count += 1
-                held = 0
-            node_of[i] = count
-            for axis in range(3):
-                nodes[count, axis] += points[i, axis]
-            held += 1
-        for axis in range(3):
-            nodes[count, axis] /= held
-        count += 1
-        begin = end
-    return nodes[:count].copy(), node_of
 
 
 @kernel

@@ -12,7 +12,8 @@ import numpy as np
 from pipeline.compiler import kernel
 from pipeline.geometry import nearest_neighbours
 from pipeline.kernels.normal_equations import moments_of, solve_plane_moments
-from pipeline.model import FloatArray, LabelArray, Plane
+from pipeline.model import BoolArray, FloatArray, LabelArray, Plane
+from pipeline.segmentation.plane_regression import best_fit_plane, cluster_sums
 
 _LOWER_QUARTILE_CHI2 = (math.nan, 0.10153, 0.57536, 1.21253, 1.92256, 2.67460, 3.45460)
 """Lower quartile of the chi-squared distribution with 0 to 6 degrees of freedom."""
@@ -144,3 +145,21 @@ def noise_sigma_m(points: FloatArray) -> float:
     neighbours = nearest_neighbours(xyz[:, :2], freedom + 2)
     quartile = float(np.percentile(_local_plane_sse(xyz, neighbours), 25.0))
     return math.sqrt(quartile / _LOWER_QUARTILE_CHI2[freedom])
+
+
+def kept_clusters(labels: LabelArray, values: FloatArray, kept: BoolArray) -> tuple[LabelArray, FloatArray]:
+    """The clusters `kept` (k,), renumbered in their order: labels, -1 for none, and the values (k, ...) of each."""
+    number = np.full(len(kept) + 1, -1, np.int32)
+    number[:-1][kept] = np.arange(int(kept.sum()), dtype=np.int32)
+    return number[labels], values[kept]
+
+
+def best_fit_planes(
+    points: FloatArray, labels: LabelArray, n_clusters: int, min_points: int = 0
+) -> tuple[FloatArray, LabelArray]:
+    """Planes (a, b, c) of the clusters that have one and enough points, (k, 3), and the labels renumbered."""
+    sums = cluster_sums(points, labels, n_clusters)
+    fits = [best_fit_plane(row) for row in sums]
+    kept = np.array([fit[3] and row[0] >= min_points for fit, row in zip(fits, sums, strict=True)], np.bool_)
+    labels, planes = kept_clusters(labels, np.array([fit[:3] for fit in fits]).reshape(-1, 3), kept)
+    return planes, labels

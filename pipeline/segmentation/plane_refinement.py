@@ -1,8 +1,8 @@
-"""From the rough clusters of a TIN to roof planes of its points (Shorter and Kasparis, section 3.3).
+"""From the rough clusters of a TIN to the roof planes of its points (Shorter and Kasparis, section 3.3).
 
-Rounds of: best-fit planes of the clusters on the *original* elevations, clusters of one plane merged, points
-reassigned to the planes around them, outliers absorbed. The paper describes these steps; its thresholds are unpublished
-and are settings here.
+Each round fits planes to the clusters on the *original* elevations, merges clusters of one plane, reassigns points to
+the planes around them, and absorbs outliers. The paper describes these steps without their thresholds, which are
+settings here.
 """
 
 from __future__ import annotations
@@ -17,14 +17,13 @@ from pipeline.errors import BuildingError
 from pipeline.model import BoolArray, FloatArray, LabelArray, Reason
 from pipeline.segmentation.plane_merge import merge_planes, parallel_pairs_in_reach
 from pipeline.segmentation.plane_regression import best_fit_plane, cluster_sums, cosine_of_slope
-from pipeline.segmentation.plane_settings import PlaneRefinementSettings
 from pipeline.segmentation.point_assignment import (
     dissolve_redundant,
     distance_to_plane,
-    nearest_plane,
     touching_pairs,
     vote_among_neighbours,
 )
+from pipeline.segmentation.refinement_settings import PlaneRefinementSettings
 
 _MIN_SEED_POINTS = 4
 """In the first round a cluster may still be small: its points have not been assigned by planes yet."""
@@ -230,3 +229,22 @@ def _renumber(
         fitted[m, 1] = b if good else planes[k, 1]
         fitted[m, 2] = c if good else planes[k, 2]
     return fitted, labels
+
+
+@kernel
+def nearest_plane(points: FloatArray, planes: FloatArray, usable: BoolArray, distance_m: float) -> LabelArray:
+    """The nearest of all planes within the distance: the paper's merging of points with planes.
+
+    Returns (n,) int32, -1 for none; parameters as for `vote_among_neighbours`.
+    """
+    labels = np.full(points.shape[0], -1, np.int32)
+    for i in range(points.shape[0]):
+        least = distance_m
+        for k in range(usable.size):
+            if not usable[k]:
+                continue
+            distance = distance_to_plane(points, i, planes, k)
+            if distance < least or (distance == least and labels[i] < 0):
+                least = distance
+                labels[i] = k
+    return labels

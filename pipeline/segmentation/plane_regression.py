@@ -1,8 +1,8 @@
-"""Best-fit planes z = b0 + b1 x + b2 y by least squares (Shorter and Kasparis, Eqs. 8 to 14), from sums a cluster.
+"""Best-fit planes z = b0 + b1 x + b2 y by least squares (Shorter and Kasparis, Eqs. 8 to 14), from sums per cluster.
 
-All that the regression needs of a cluster are ten sums over its points. The sums of two clusters add up to those of
-their union, so merging needs no second look at the points, and they are taken in the order of the points, so the
-planes do not depend on a linear algebra library.
+The regression needs ten sums over the points of a cluster. The sums of a union are the sums of its two clusters, so
+merging does not read the points again. They are added in the order of the points, so the planes do not depend on a
+linear algebra library.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.kernels.normal_equations import add_to_sums, solve_plane_moments
-from pipeline.model import BoolArray, FloatArray, LabelArray, Plane
+from pipeline.model import FloatArray, LabelArray, Plane
 
 N_SUMS = 10
 """n, x, y, z, xx, xy, yy, xz, yz, zz."""
@@ -66,24 +66,6 @@ def best_fit_plane(sums: FloatArray) -> tuple[float, float, float, bool]:
     yz = sums[8] / n - y * z
     a, b = solve_plane_moments(xx, xy, yy, xz, yz)
     return a, b, z - a * x - b * y, True
-
-
-def kept_clusters(labels: LabelArray, values: FloatArray, kept: BoolArray) -> tuple[LabelArray, FloatArray]:
-    """The clusters `kept` (k,), renumbered in their order: labels, -1 for none, and the values (k, ...) of each."""
-    number = np.full(len(kept) + 1, -1, np.int32)
-    number[:-1][kept] = np.arange(int(kept.sum()), dtype=np.int32)
-    return number[labels], values[kept]
-
-
-def best_fit_planes(
-    points: FloatArray, labels: LabelArray, n_clusters: int, min_points: int = 0
-) -> tuple[FloatArray, LabelArray]:
-    """Planes (a, b, c) of the clusters that have one and enough points, (k, 3), and the labels renumbered."""
-    sums = cluster_sums(points, labels, n_clusters)
-    fits = [best_fit_plane(row) for row in sums]
-    kept = np.array([fit[3] and row[0] >= min_points for fit, row in zip(fits, sums, strict=True)], np.bool_)
-    labels, planes = kept_clusters(labels, np.array([fit[:3] for fit in fits]).reshape(-1, 3), kept)
-    return planes, labels
 
 
 @kernel

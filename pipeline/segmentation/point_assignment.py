@@ -1,4 +1,4 @@
-"""Which plane a point belongs to: the paper's merging of points with planes, and a vote among neighbours."""
+"""The plane of each point: the paper's merging of points with planes, and a vote among neighbours."""
 
 from __future__ import annotations
 
@@ -139,25 +139,6 @@ def vote_among_neighbours(
         for q in range(n_changes):
             changed[changes[q]] = True
     return old
-
-
-@kernel
-def nearest_plane(points: FloatArray, planes: FloatArray, usable: BoolArray, distance_m: float) -> LabelArray:
-    """The nearest of all planes within the distance: the paper's merging of points with planes.
-
-    Returns (n,) int32, -1 for none; parameters as for `vote_among_neighbours`.
-    """
-    labels = np.full(points.shape[0], -1, np.int32)
-    for i in range(points.shape[0]):
-        least = distance_m
-        for k in range(usable.size):
-            if not usable[k]:
-                continue
-            distance = distance_to_plane(points, i, planes, k)
-            if distance < least or (distance == least and labels[i] < 0):
-                least = distance
-                labels[i] = k
-    return labels
 
 
 @kernel

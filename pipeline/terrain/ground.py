@@ -16,7 +16,7 @@ from pipeline.compiler import kernel
 from pipeline.model import BoolArray, IntArray
 from pipeline.registry import loaded
 from pipeline.terrain.filter_settings import FILTERS, FoundGround
-from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations, Part, lowest_per_cell, part_around, without_pits
+from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations, Part, lowest_per_cell, part_around
 from pipeline.terrain.planar_fitting import FEWEST_SIDES, MIN_CELLS, meeting_sides, plane_around, plane_sums, sum_within
 from pipeline.terrain.settings import GroundSettings
 from pipeline.terrain.support import NEAR_CELLS
@@ -228,6 +228,8 @@ def ground_on(
         if trusted:
             found = FoundGround(part != NO_DATA, part != NO_DATA)
         else:
+            from pipeline.terrain.pits import without_pits
+
             part = without_pits(part, round(settings.pit_depth_m * 1000))
             found = loaded(FILTERS[settings.filter].find)(part, (column0 + west, row0 + south), settings, drawn)
         grounds = (found.near, found.wide)

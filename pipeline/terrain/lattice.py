@@ -7,7 +7,6 @@ import numpy.typing as npt
 
 from pipeline.compiler import kernel
 from pipeline.model import BoolArray, IntArray
-from pipeline.terrain.support import PIT_CELLS
 
 CELL_MM = 1000
 """Side of a cell of the terrain lattice."""
@@ -21,9 +20,6 @@ Elevations = npt.NDArray[np.int32]
 
 Part = tuple[slice, slice]
 """Rows and columns of a lattice."""
-
-PIT_MATES = 2
-"""At most this many neighbours of a pit are as deep: low outliers come alone or in small groups."""
 
 
 def part_around(part: Part, margin: int, shape: tuple[int, ...]) -> Part:
@@ -52,32 +48,6 @@ def lowest_per_cell(
             if 0 <= c < columns and 0 <= r < rows and z_mm[i] < lowest[r, c]:
                 lowest[r, c] = z_mm[i]
     return lowest
-
-
-@kernel
-def without_pits(lowest: Elevations, depth_mm: int, mates: int = PIT_MATES) -> Elevations:
-    """Clear cells that lie deeper than depth_mm below all but at most `mates` of the 24 cells around."""
-    rows, columns = lowest.shape
-    out = lowest.copy()
-    for r in range(rows):
-        for c in range(columns):
-            z = lowest[r, c]
-            if z == NO_DATA:
-                continue
-            near, filled = 0, 0
-            for a in range(max(r - PIT_CELLS, 0), min(r + PIT_CELLS + 1, rows)):
-                # most cells have enough cells near their level in the first row
-                if near > mates:
-                    break
-                for b in range(max(c - PIT_CELLS, 0), min(c + PIT_CELLS + 1, columns)):
-                    other = lowest[a, b]
-                    if other != NO_DATA and (a != r or b != c):
-                        filled += 1
-                        if other - z <= depth_mm:
-                            near += 1
-            if filled > mates and near <= mates:
-                out[r, c] = NO_DATA
-    return out
 
 
 @kernel

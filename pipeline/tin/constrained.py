@@ -12,7 +12,7 @@ import dataclasses
 import numpy as np
 
 from pipeline.compiler import kernel
-from pipeline.kernels.bounds import bounds_of
+from pipeline.geometry import bounds_of
 from pipeline.kernels.heap import heap_pop, heap_push, heap_with_room
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
 from pipeline.tin.delaunay import insert_all, strip_order

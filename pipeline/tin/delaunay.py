@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from pipeline.compiler import kernel
-from pipeline.kernels.bounds import bounds_of
+from pipeline.geometry import bounds_of
 from pipeline.kernels.sorting import radix_order
 from pipeline.model import FloatArray, IntArray, LabelArray, Tin
 from pipeline.tin.half_edges import canonical_facets, locate, restore_delaunay, split_facet, start_sphere

@@ -17,10 +17,8 @@ import shapely
 
 from pipeline.io.crs import to_degrees
 from service.errors import RequestError
-from service.features.index import Box
+from service.features.index import CRS84, Box
 
-CRS84 = "http://www.opengis.net/def/crs/OGC/1.3/CRS84"
-"""Longitude and latitude in WGS 84: the default."""
 _EPSG = "http://www.opengis.net/def/crs/EPSG/0/"
 _ALWAYS = {CRS84: "OGC:CRS84", f"{_EPSG}4326": "EPSG:4326", f"{_EPSG}3857": "EPSG:3857"}
 _DECIMALS_DEG, _DECIMALS = 9, 3
@@ -78,7 +76,7 @@ class RunCrs:
         self.storage_uri: str | None = None
         """URI of its horizontal part; None without an EPSG code."""
         self.to_degrees: pyproj.Transformer | None = None
-        """The transformation to longitude and latitude; None without one, as of a local CRS."""
+        """The transformation to longitude and latitude; None without one, as in a local CRS."""
         self._known = dict(_ALWAYS)
         if self.whole is not None:
             own = (self.whole.sub_crs_list[0] if self.whole.is_compound else self.whole).to_2d()

@@ -244,7 +244,7 @@ async def run_schedule(
 
 @router.get(
     "/schedules/{scheduleID}/runs",
-    summary="What happened to a schedule's slots",
+    summary="Outcomes of a schedule's times",
     responses={
         200: document(wire.ScheduleRunList, "Latest first.", {"runs": [SCHEDULE_RUN_EXAMPLE], "links": []}),
         **problems(400, 404),

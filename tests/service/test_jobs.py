@@ -101,7 +101,7 @@ def test_progress_grows_with_the_stages_and_within_them(steps: list[tuple[str, i
 
 def test_the_stages_make_up_the_whole_job() -> None:
     # what a comparison does besides is short: progress stands still meanwhile; kernels are compiled once
-    others = {"compile", "records", "points", "pictures", "page"}
+    others = {"compile", "redraw", "records", "points", "pictures", "page"}
     assert set(WORDS) - set(WEIGHTS) - set(CLASSIFY_WEIGHTS) == others
     assert [percent("compile", done, 100) for done in (0, 50, 100)] == [0, COMPILING // 2, COMPILING]
     for weights in (WEIGHTS, CLASSIFY_WEIGHTS):

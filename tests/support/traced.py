@@ -7,7 +7,7 @@ from opentelemetry.sdk.trace import ReadableSpan
 from opentelemetry.sdk.trace.export import SimpleSpanProcessor
 from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanExporter
 
-from pipeline.runtime.monitoring import traces, tracing
+from pipeline.runtime.monitoring import progress, tracing
 
 
 class Spans:
@@ -42,7 +42,7 @@ def trace_of(span: ReadableSpan) -> int:
 def spans(monkeypatch: pytest.MonkeyPatch) -> Iterator[Spans]:
     """Traces are on, and their spans stay here."""
     found = Spans()
-    monkeypatch.setattr(traces, "are_wanted", lambda: True)
+    monkeypatch.setattr(progress, "traces_are_wanted", lambda: True)
     monkeypatch.setattr(tracing, "is_on", lambda: True)
     monkeypatch.setattr(tracing, "provider", lambda: found.provider)
     yield found

@@ -40,8 +40,8 @@ from pipeline.runtime.monitoring.progress import Listener, Progress, ignore, nev
 from pipeline.runtime.request import RunRequest, plan_inputs
 from pipeline.runtime.resources import Resources
 from pipeline.runtime.run_context import RunContext, run_context
+from pipeline.runtime.scratch.abandoned import locked_folder, remove_abandoned
 from pipeline.runtime.scratch.folder import Scratch
-from pipeline.runtime.scratch.folder_lock import locked_folder, remove_abandoned
 from pipeline.runtime.scratch.outcomes import Place, key_of, whole
 from pipeline.runtime.scratch.work_folder import locked_work
 from pipeline.runtime.stages.ground import find_ground

@@ -15,7 +15,8 @@ from pipeline.compiler import kernel
 from pipeline.extras.classify.sparse_points import FAR_MM, Role, SparsePoints, likely_building
 from pipeline.model import BoolArray, ByteArray, IntArray, KindArray
 from pipeline.spatial_hash import points_by_cell, slot_of_key
-from pipeline.terrain.lattice import NO_DATA, PIT_MATES
+from pipeline.terrain.lattice import NO_DATA
+from pipeline.terrain.pits import PIT_MATES
 from pipeline.terrain.settings import VegetationSettings
 from pipeline.terrain.thinning import highest_per_cell
 from pipeline.terrain.vegetation import planarity

@@ -8,7 +8,8 @@ from functools import partial
 
 import numpy as np
 
-from pipeline.building.drawing import Building, block_model
+from pipeline.building.blocks import block_model
+from pipeline.building.drawing import Building
 from pipeline.building.form_search import first_valid
 from pipeline.building.record import record_of
 from pipeline.errors import BuildingError

@@ -16,7 +16,8 @@ from pipeline.compiler import kernel
 from pipeline.extras.hierarchical_filter.tin_densification import join_facets
 from pipeline.model import BoolArray
 from pipeline.terrain.filter_settings import FoundGround, HierarchicalFilterSettings
-from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations, Part, without_pits
+from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations, Part
+from pipeline.terrain.pits import without_pits
 from pipeline.terrain.planar_fitting import plane_around, plane_sums
 from pipeline.terrain.settings import GroundSettings
 from pipeline.terrain.support import PIT_CELLS

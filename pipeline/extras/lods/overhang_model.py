@@ -12,7 +12,7 @@ from pipeline.extras.lods.wider_eaves import wider_parts
 from pipeline.methods import OVERHANGS
 from pipeline.model import Decision, DecisionKind, NoOverhang, Outcome, Overhangs, OverhangSource, Solid
 from pipeline.quality.validity import check_solid
-from pipeline.roof.footprint import footprint_in_mm
+from pipeline.roof.footprint_in_mm import footprint_in_mm
 from pipeline.roof.solid import renumbered, united
 
 _LEAST_BEYOND_M2 = 0.05

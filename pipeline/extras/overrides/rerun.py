@@ -40,12 +40,11 @@ from pipeline.runtime.monitoring.progress import Listener, Progress, ignore, nev
 from pipeline.runtime.request import RunRequest, input_file, plan_inputs, request_record
 from pipeline.runtime.resources import Resources
 from pipeline.runtime.run_context import RunContext, run_context
-from pipeline.runtime.run_directory import OVERRIDES, put_json
+from pipeline.runtime.run_directory import NOTHING_FOUND, OVERRIDES, put_json
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.folder_lock import locked_results
 from pipeline.runtime.scratch.location import run_scratch
 from pipeline.runtime.stages.batch_figures import REJECTED, Modelled
-from pipeline.runtime.stages.counts import NOTHING_FOUND
 from pipeline.runtime.stages.gather import gather
 from pipeline.runtime.stages.ground import cells_of_blocks, find_ground
 from pipeline.runtime.stages.ingest import ingest

@@ -17,7 +17,7 @@ from pipeline.compiler import kernel
 from pipeline.errors import BuildingError
 from pipeline.extras.papers.clustering_settings import ClusterMembershipSettings
 from pipeline.model import BoolArray, FloatArray, LabelArray, Reason
-from pipeline.segmentation.plane_regression import kept_clusters
+from pipeline.segmentation.facet_geometry import kept_clusters
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -29,8 +29,14 @@ from pipeline.extras.papers.surrounding_ground import far_from
 from pipeline.geometry import nearest_neighbours, point_spacing_m
 from pipeline.model import FloatArray, LabelArray, Plane, PlanFace, PreparedCloud, Reason, Segmentation, Tin
 from pipeline.prepared_cloud import require_visible
-from pipeline.segmentation.facet_geometry import facet_areas_m2, facet_normals, noise_sigma_m, vertical_residuals_m
-from pipeline.segmentation.plane_regression import best_fit_planes, describe_planes
+from pipeline.segmentation.facet_geometry import (
+    best_fit_planes,
+    facet_areas_m2,
+    facet_normals,
+    noise_sigma_m,
+    vertical_residuals_m,
+)
+from pipeline.segmentation.plane_regression import describe_planes
 from pipeline.tin.delaunay import triangulate
 
 _MIN_FACETS = 3

@@ -24,8 +24,8 @@ from pipeline.extras.papers.single_linkage import cluster_by_linkage
 from pipeline.geometry import nearest_neighbours, point_spacing_m
 from pipeline.model import BoolArray, FloatArray, LabelArray, PreparedCloud, RoofType, Segmentation, Tin
 from pipeline.prepared_cloud import require_visible
-from pipeline.segmentation.facet_geometry import facet_areas_m2, noise_sigma_m
-from pipeline.segmentation.plane_regression import best_fit_planes, describe_planes, kept_clusters
+from pipeline.segmentation.facet_geometry import best_fit_planes, facet_areas_m2, kept_clusters, noise_sigma_m
+from pipeline.segmentation.plane_regression import describe_planes
 from pipeline.segmentation.point_assignment import vote_among_neighbours
 from pipeline.tin.delaunay import triangulate, unique_xy
 

@@ -1,4 +1,4 @@
-"""The arrangement: labelled roof points and planes to roof faces that fill an outline exactly."""
+"""The arrangement: turns labelled roof points and planes into roof faces that fill an outline exactly."""
 
 from __future__ import annotations
 
@@ -25,13 +25,12 @@ from pipeline.roof.arrangement.far_corners import (
 )
 from pipeline.roof.arrangement.guide_lines import NO_GUIDES, Guides, mark_edges_on_guides, with_guides
 from pipeline.roof.arrangement.joined_planes import joined_planes
-from pipeline.roof.arrangement.limits import Limits, limits_at
 from pipeline.roof.arrangement.merged_vertices import merge_vertices, rings_with_merged
 from pipeline.roof.arrangement.minimum_cut import costs_of_all, every_label, expand_labels, neighbour_lists
 from pipeline.roof.arrangement.movable_borders import Borders, edges_of_rings
 from pipeline.roof.arrangement.moved_vertices import move_vertices
 from pipeline.roof.arrangement.plane_refit import labels_of_points, refitted_planes, support_of_planes
-from pipeline.roof.arrangement.raster_labels import raster_labels
+from pipeline.roof.arrangement.raster_labels import Limits, limits_at, raster_labels
 from pipeline.roof.arrangement.subdivision import CELLS, EDGES, VERTICES, Subdivision, subdivide, subdivision_of
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.settings import ArrangementSettings

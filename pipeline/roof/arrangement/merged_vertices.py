@@ -1,4 +1,4 @@
-"""Borders of roof faces with as few corners as the points need: vertices that pay too little go to a neighbour.
+"""Borders of roof faces with as few corners as the points need: vertices that pay too little merge with a neighbour.
 
 A vertex of the faces' borders is worth a few points (minimum description length). It is merged with a neighbour where
 that changes the costs of the points by less: jogs of steps become straight, clusters of vertices become one, a hip that
@@ -14,7 +14,6 @@ import numpy as np
 from pipeline.compiler import kernel
 from pipeline.kernels.sorting import ascending_order
 from pipeline.model import FloatArray, IntArray
-from pipeline.roof.arrangement.limits import Limits
 from pipeline.roof.arrangement.movable_borders import (
     KEEPS,
     MAX_DEGREE,
@@ -27,6 +26,7 @@ from pipeline.roof.arrangement.movable_borders import (
     ends_at_vertices,
     star_is_sound,
 )
+from pipeline.roof.arrangement.raster_labels import Limits
 
 _ONE_WAY = 0.1
 """Sine of the angle below which edges have one direction."""

@@ -15,14 +15,15 @@ from pipeline.errors import ClusterError, VersionMismatchError
 from pipeline.runtime.cluster import worker_setup
 from pipeline.runtime.cluster.dispatch import SETTLE_INTERRUPTED_S, SETTLE_S, ClusterMonitor, Dispatch
 from pipeline.runtime.cluster.memory_needs import RESOURCE
+from pipeline.runtime.cluster.packed_tasks import differences, mismatch_message
 from pipeline.runtime.cluster.performance_report import PerformanceReport
 from pipeline.runtime.cluster.priorities import Traffic, priority_of
 from pipeline.runtime.cluster.tls import TlsFiles, check_address, explain_failure, given_tls
 from pipeline.runtime.cluster.worker_fork_server import forked_workers
 from pipeline.runtime.isolation.spawned_child import environment_with_this_package
-from pipeline.runtime.monitoring.measurement import Measured, Result, Task, mismatch_message
+from pipeline.runtime.monitoring.measurement import Measured, Result, Task
 from pipeline.runtime.monitoring.progress import TICK_S, Watch
-from pipeline.runtime.monitoring.versions import ENGINE, TALKING, WORKING, differences
+from pipeline.runtime.monitoring.versions import ENGINE, TALKING, WORKING
 
 CONNECT_S = 20.0
 """Time-out of the connection to a scheduler."""

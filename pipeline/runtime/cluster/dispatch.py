@@ -23,8 +23,9 @@ from typing import Any, Generic
 
 from pipeline.errors import ClusterError, GableworkError, RunCancelledError, RunError
 from pipeline.runtime.cluster.memory_needs import RESOURCE, announced_bytes, declared_bytes
+from pipeline.runtime.cluster.packed_tasks import measure_packed, pack_tasks
 from pipeline.runtime.monitoring.logs import LOG, facts_of_task
-from pipeline.runtime.monitoring.measurement import TALLIES, Measured, Result, Task, measure_packed, pack_tasks
+from pipeline.runtime.monitoring.measurement import TALLIES, Measured, Result, Task
 from pipeline.runtime.monitoring.progress import TICK_S, Event, Watch
 from pipeline.runtime.monitoring.versions import fingerprint
 

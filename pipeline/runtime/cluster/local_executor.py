@@ -27,19 +27,11 @@ from typing import Any, Generic, Self
 
 from pipeline.errors import RunCancelledError, RunError
 from pipeline.runtime.cluster.dispatch import SETTLE_INTERRUPTED_S, blame, tried_alone
+from pipeline.runtime.cluster.packed_tasks import measure_in_child
 from pipeline.runtime.isolation.child_pool import FRUITLESS_STARTS, borrowed_child, start_failure
 from pipeline.runtime.isolation.supervision import ChildEnd
 from pipeline.runtime.monitoring.logs import LOG, facts_of_task
-from pipeline.runtime.monitoring.measurement import (
-    TALLIES,
-    Measured,
-    Result,
-    Task,
-    cores,
-    measure,
-    measure_in_child,
-    memory_bytes,
-)
+from pipeline.runtime.monitoring.measurement import TALLIES, Measured, Result, Task, cores, measure, memory_bytes
 from pipeline.runtime.monitoring.progress import TICK_S, Watch
 
 _WORN_BYTES = 2**30

@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import functools
+import logging
 import math
 import os
-import pickle
 import resource
 import socket
 import threading
 import time
-import traceback
 from collections import Counter, defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from pipeline.errors import GableworkError, RunCancelledError, VersionMismatchError
-from pipeline.runtime.monitoring.logs import LOG, about, facts_of_task, wants_json
-from pipeline.runtime.monitoring.versions import differences, fingerprint, versions_here, versions_of
+from pipeline.errors import GableworkError, RunCancelledError
+from pipeline.runtime.monitoring.logs import LOG, about, facts_of_task
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -96,52 +96,6 @@ def measure(function: Callable[[Task], Result], task: Task, stage: str = "") -> 
         process=process,
         peak_bytes=peak_bytes,
         tile=None if tile is None else str(tile),
-    )
-
-
-def measure_in_child(work: tuple[Callable[[Task], Result], Task, str]) -> Measured[Result]:
-    """Run one task in a child process; an unexpected error carries its traceback as a note."""
-    try:
-        return measure(*work)
-    except GableworkError:
-        raise
-    except Exception as error:
-        # a traceback does not survive pickling, a note does
-        error.add_note(traceback.format_exc())
-        raise
-
-
-def pack_tasks(function: Callable[[Task], Result], tasks: Sequence[Task]) -> bytes:
-    """A function and some of its tasks as bytes for another process.
-
-    A Dask scheduler unpickles what it passes on; with bytes it need not import what only workers need.
-    """
-    return pickle.dumps((function, tasks), protocol=pickle.HIGHEST_PROTOCOL)
-
-
-def measure_packed(client_fingerprint: str, packed: bytes, stage: str = "") -> list[Measured[Any]]:
-    """Run and measure a client's packed tasks one after the other, if this process has the client's versions.
-
-    If it has others VersionMismatchError is raised, since a late worker must not mix other versions into a result. This
-    happens before the tasks are unpickled, which could then fail in strange ways.
-    """
-    if wants_json():
-        from pipeline.runtime.monitoring.log_lines import configure_as_json
-
-        configure_as_json()
-    if client_fingerprint != fingerprint():
-        process, _ = peak_of_process()
-        differing = differences(versions_of(client_fingerprint), versions_here())
-        raise VersionMismatchError(mismatch_message([f"worker {process}: {', '.join(differing)}"]))
-    function, tasks = pickle.loads(packed)  # noqa: S301 - from the client, whose code the worker runs anyway
-    return [measure(function, task, stage) for task in tasks]
-
-
-def mismatch_message(faults: list[str]) -> str:
-    """The message of a version mismatch, from the differences of each process."""
-    return (
-        f"the processes do not run the same versions: {'; '.join(faults)}. "
-        "Install the same gablework with the same locks everywhere (one image), then start again"
     )
 
 
@@ -230,3 +184,46 @@ class Tallies:
 
 TALLIES = Tallies()
 """Tallies of this process."""
+
+
+TRACING_LOG = logging.getLogger("gablework.tracing")
+
+
+ENDPOINTS = ("OTEL_EXPORTER_OTLP_TRACES_ENDPOINT", "OTEL_EXPORTER_OTLP_ENDPOINT")
+"""Variables that turn traces on."""
+
+
+SLOW_BUILDING_S = 1.0
+"""Seconds of a building from which it gets a span, unless `GABLEWORK_TRACE_BUILDING_S` has another number."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Part:
+    """A part of a task that gets a span of its own."""
+
+    name: str
+    """Its kind."""
+    began_s: float
+    ended_s: float
+    """Its times in seconds since 1970."""
+    error: str | None = None
+    """Why it failed."""
+    facts: Mapping[str, Any]
+    """Its attributes."""
+
+
+def traces_are_wanted() -> bool:
+    """Whether a variable names a collector."""
+    return any(os.environ.get(name) for name in ENDPOINTS)
+
+
+@functools.cache
+def slow_building_s() -> float:
+    """Seconds of a building from which it gets a span of its own; a number that makes no sense costs a warning."""
+    text = os.environ.get("GABLEWORK_TRACE_BUILDING_S", "")
+    with contextlib.suppress(ValueError):
+        seconds = float(text or SLOW_BUILDING_S)
+        if seconds >= 0.0:
+            return seconds
+    TRACING_LOG.warning("GABLEWORK_TRACE_BUILDING_S is %r: give seconds from 0 on; %g is used", text, SLOW_BUILDING_S)
+    return SLOW_BUILDING_S

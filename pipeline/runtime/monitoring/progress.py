@@ -9,13 +9,12 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, Literal
 
 from pipeline.errors import RunCancelledError
-from pipeline.runtime.monitoring.measurement import Measured
-from pipeline.runtime.monitoring.traces import Part, are_wanted
+from pipeline.runtime.monitoring.measurement import Measured, Part, traces_are_wanted
 
 
 def span(name: str, *, first: bool = False, **facts: Any) -> contextlib.AbstractContextManager[Any]:
     """A span around a block while traces are on; the `first` one only if there is none around it."""
-    if not are_wanted():
+    if not traces_are_wanted():
         return contextlib.nullcontext()
     from pipeline.runtime.monitoring import tracing
 
@@ -77,7 +76,7 @@ class Progress:
     def measured(self, found: Measured[Any], parts: Callable[[], Iterable[Part]] = tuple) -> None:
         """Note the peak memory of the process that ran a task, and the spans of the task and of its parts."""
         self.peaks[found.process] = max(self.peaks.get(found.process, 0), found.peak_bytes)
-        if not are_wanted():
+        if not traces_are_wanted():
             return
         from pipeline.runtime.monitoring import tracing
 

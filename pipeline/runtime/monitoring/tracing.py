@@ -18,7 +18,7 @@ import time
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
-from pipeline.runtime.monitoring.traces import ENDPOINTS, LOG, are_wanted
+from pipeline.runtime.monitoring.measurement import ENDPOINTS, TRACING_LOG, traces_are_wanted
 
 if TYPE_CHECKING:
     from opentelemetry.sdk.trace import SpanProcessor, TracerProvider
@@ -68,7 +68,7 @@ class Parent:
 @functools.cache
 def is_on() -> bool:
     """Whether spans are made; read from the environment once."""
-    if not are_wanted():
+    if not traces_are_wanted():
         return False
     if os.environ.get("OTEL_SDK_DISABLED", "").lower() == "true" or os.environ.get("OTEL_TRACES_EXPORTER") == "none":
         return False
@@ -76,7 +76,9 @@ def is_on() -> bool:
         import opentelemetry.exporter.otlp.proto.http.trace_exporter
         import opentelemetry.sdk.trace  # noqa: F401 - both are there, or none is used
     except ImportError:
-        LOG.warning("%s asks for traces, which need OpenTelemetry: install gablework[otel]", " or ".join(ENDPOINTS))
+        TRACING_LOG.warning(
+            "%s asks for traces, which need OpenTelemetry: install gablework[otel]", " or ".join(ENDPOINTS)
+        )
         return False
     return True
 

@@ -62,29 +62,3 @@ def fingerprint() -> str:
     True
     """
     return ";".join(f"{name}={version}" for name, version in versions_here().items())
-
-
-def versions_of(line: str) -> dict[str, str]:
-    """The versions in a fingerprint.
-
-    >>> versions_of("gablework=0.1.0;numpy=2.1")
-    {'gablework': '0.1.0', 'numpy': '2.1'}
-    """
-    return dict(entry.split("=", 1) for entry in line.split(";"))
-
-
-def differences(ours: Mapping[str, str], theirs: Mapping[str, str]) -> list[str]:
-    """Differences in words, for the packages of `ours`.
-
-    >>> differences({"numpy": "2.1", "numba": "0.63"}, {"numpy": "2.0", "numba": "0.63"})
-    ['numpy 2.0 where the client has 2.1']
-    >>> differences({"numba": "0.63"}, {})
-    ['no numba where the client has 0.63']
-    """
-    found = []
-    for name, version in ours.items():
-        other = theirs.get(name, "none")
-        if other != version:
-            has = f"no {name}" if other == "none" else f"{name} {other}"
-            found.append(f"{has} where the client has {'none' if version == 'none' else version}")
-    return found

@@ -11,7 +11,6 @@ from uuid import uuid4
 
 from pipeline.errors import RunError
 from pipeline.io import is_url, shown
-from pipeline.io.temporary import temporary_folder
 from pipeline.runtime.scratch.folder import Scratch
 
 SCRATCH = "scratch"
@@ -38,6 +37,8 @@ def run_scratch(run_dir: str, scratch: str | None) -> Iterator[Scratch]:
     """Scratch for the duration of a run; raises RunError if scratch of an earlier run cannot be removed."""
     with contextlib.ExitStack() as stack:
         if scratch is None and is_url(run_dir):
+            from pipeline.io.temporary import temporary_folder
+
             # no other user can guess its name, or look into it: tasks trust what they read from scratch
             folder = stack.enter_context(temporary_folder()) / SCRATCH
         else:

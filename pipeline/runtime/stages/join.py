@@ -34,10 +34,10 @@ from pipeline.runtime.scratch.outcomes import (
 from pipeline.runtime.stages.border_facets import are_beyond, united_by_name
 from pipeline.runtime.stages.cleanup import clear_units
 from pipeline.runtime.stages.open_fragments import BorderFacets, Finished, OpenSurfaces, finished
-from pipeline.runtime.stages.sites import UNITS, FoundSites, Joined
+from pipeline.runtime.stages.sites import UNITS, Joined
 from pipeline.runtime.stages.split import Split, Splits
 from pipeline.runtime.stages.stored_sites import joined_of, store_sites
-from pipeline.runtime.stages.tile_sites import TileSites, TileSitesFigures, by_owner, figures_of, sites_of
+from pipeline.runtime.stages.tile_sites import TileSitesFigures, by_owner, figures_of
 from pipeline.runtime.stages.units import BorderSites, find_units
 from pipeline.terrain.candidates import NOWHERE, Surfaces
 from pipeline.terrain.fragment_sums import N_SUMS
@@ -340,21 +340,3 @@ def blocks_of(tiles: Iterable[Tile], across: int) -> dict[tuple[int, int], tuple
         area = column * across, row * across, (column + 1) * across - 1, (row + 1) * across - 1
         blocks.setdefault((column, row), (area, []))[1].append(tile)
     return blocks
-
-
-def join_tiles(
-    splits: Iterable[Split], grid: TileGrid, settings: CandidateSettings, crs_name: str, across: int = _TILES_ACROSS
-) -> tuple[FoundSites, int]:
-    """The sites of some tiles, all in memory, and the number of smaller surfaces; blocks are so many tiles `across`."""
-    surfaces = {split.tile: split.surfaces for split in splits if split.surfaces is not None}
-    sites = [TileSites(found=one.done, tiles=(tile,)) for tile, one in surfaces.items()]
-    rest: list[OpenSurfaces] = []
-    for area, tiles in blocks_of(surfaces, across).values():
-        whole = united_surfaces(surfaces[tile].open for tile in tiles)
-        done, passed_on = finished_within(whole, area, settings)
-        sites.append(TileSites(found=done, tiles=whole.tiles))
-        rest.append(passed_on)
-    last = united_surfaces(rest)
-    done, _ = finished_within(last, None, settings)
-    sites.append(TileSites(found=done, tiles=last.tiles))
-    return sites_of(sites, grid, settings, crs_name), sum(one.found.small for one in sites)

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 from pipeline.model import Status
 from pipeline.registry import extra
 from pipeline.runtime.monitoring.logs import LOG
-from pipeline.runtime.monitoring.measurement import TALLIES
-from pipeline.runtime.monitoring.traces import Part, slow_building_s
+from pipeline.runtime.monitoring.measurement import TALLIES, Part, slow_building_s
 from pipeline.runtime.run_context import ProgressUnits, RunContext
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.outcomes import Files, Place, drop_outcomes, key_of, keys_of, result_of

@@ -6,6 +6,7 @@ For a process from which others are forked: it loads them once for all of them.
 from __future__ import annotations
 
 import functools
+from collections.abc import Iterable
 
 import numpy as np
 import shapely
@@ -17,12 +18,15 @@ from pipeline.roof.settings import RoofSettings
 from pipeline.runtime.scratch.folder import POINT, Scratch
 from pipeline.runtime.stages.cells import CellsTask, find_cells
 from pipeline.runtime.stages.ground import GroundTask, draw_ground
-from pipeline.runtime.stages.join import join_tiles
-from pipeline.runtime.stages.split import SplitTask, split_window
+from pipeline.runtime.stages.join import _TILES_ACROSS, blocks_of, finished_within, united_surfaces
+from pipeline.runtime.stages.open_fragments import OpenSurfaces
+from pipeline.runtime.stages.sites import FoundSites
+from pipeline.runtime.stages.split import Split, SplitTask, split_window
 from pipeline.runtime.stages.tile_content import zone_sums
+from pipeline.runtime.stages.tile_sites import TileSites, sites_of
 from pipeline.runtime.stages.units import UnitTask, divide
 from pipeline.scene import BUILDING_CLASS, GROUND_CLASS
-from pipeline.terrain.settings import ClassesInUse, SceneSettings
+from pipeline.terrain.settings import CandidateSettings, ClassesInUse, SceneSettings
 from pipeline.tiling import MM, Tile, TileGrid
 
 _SIDE_M = 24
@@ -108,3 +112,21 @@ def load(*methods: str) -> None:
         )
         for method in methods or METHODS:
             reconstruct_building(candidate, method, ReconstructSettings())
+
+
+def join_tiles(
+    splits: Iterable[Split], grid: TileGrid, settings: CandidateSettings, crs_name: str, across: int = _TILES_ACROSS
+) -> tuple[FoundSites, int]:
+    """The sites of some tiles, all in memory, and the number of smaller surfaces; blocks are so many tiles `across`."""
+    surfaces = {split.tile: split.surfaces for split in splits if split.surfaces is not None}
+    sites = [TileSites(found=one.done, tiles=(tile,)) for tile, one in surfaces.items()]
+    rest: list[OpenSurfaces] = []
+    for area, tiles in blocks_of(surfaces, across).values():
+        whole = united_surfaces(surfaces[tile].open for tile in tiles)
+        done, passed_on = finished_within(whole, area, settings)
+        sites.append(TileSites(found=done, tiles=whole.tiles))
+        rest.append(passed_on)
+    last = united_surfaces(rest)
+    done, _ = finished_within(last, None, settings)
+    sites.append(TileSites(found=done, tiles=last.tiles))
+    return sites_of(sites, grid, settings, crs_name), sum(one.found.small for one in sites)

@@ -12,7 +12,7 @@ from typing import Any
 import sqlalchemy as sa
 from alembic import op
 
-from pipeline.parameters import RENAMED
+from pipeline.renamed_settings import RENAMED
 
 revision = "0003"
 down_revision = "0002"

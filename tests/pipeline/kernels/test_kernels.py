@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.compiler import kernel
-from pipeline.kernels.bounds import bounds_of
+from pipeline.geometry import bounds_of
 from pipeline.kernels.exact_sum import exact_sum
 from pipeline.kernels.heap import heap_pop, heap_push, heap_with_room
 from pipeline.kernels.normal_equations import moments_of, solve_plane_moments

@@ -18,7 +18,7 @@ from pipeline.geometry import point_spacing_m
 from pipeline.model import FloatArray, LabelArray, Reason, Solid
 from pipeline.quality.validity import check_solid
 from pipeline.roof.arrangement.arranging import arrange
-from pipeline.roof.footprint import footprint_in_mm
+from pipeline.roof.footprint_in_mm import footprint_in_mm
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.settings import ArrangementSettings
 from pipeline.roof.solid import SolidPart, solid_parts

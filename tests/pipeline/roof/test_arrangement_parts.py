@@ -17,7 +17,6 @@ from pipeline.roof.arrangement.cells import (
     unite_faces,
 )
 from pipeline.roof.arrangement.faces import rings_of_faces
-from pipeline.roof.arrangement.limits import Limits, limits_at
 from pipeline.roof.arrangement.minimum_cut import (
     Allowed,
     Costs,
@@ -27,7 +26,7 @@ from pipeline.roof.arrangement.minimum_cut import (
     expand_labels,
     neighbour_lists,
 )
-from pipeline.roof.arrangement.raster_labels import _SETTLING_ROUNDS, Raster, _framed, _settle
+from pipeline.roof.arrangement.raster_labels import _SETTLING_ROUNDS, Limits, Raster, _framed, _settle, limits_at
 from pipeline.roof.arrangement.subdivision import (
     EDGES,
     FACE,

@@ -13,9 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.roof.borders import straighten_borders
-from pipeline.roof.footprint import clip_partition
 from pipeline.roof.partition import RoofPartition, march
 from pipeline.roof.settings import RoofSettings
+from pipeline.roof.traced_forms import clip_partition
 from pipeline.tin.delaunay import triangulate
 
 ExactRoofs = Callable[..., Any]

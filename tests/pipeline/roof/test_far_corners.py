@@ -16,7 +16,7 @@ from pipeline.roof.arrangement.far_corners import (
     heights_raster,
     with_level_planes,
 )
-from pipeline.roof.arrangement.limits import limits_at
+from pipeline.roof.arrangement.raster_labels import limits_at
 from pipeline.roof.arrangement.subdivision import FACE, insert_chord, insert_vertex, subdivision_of
 from pipeline.roof.settings import ArrangementSettings
 

@@ -6,9 +6,9 @@ import shapely
 
 from pipeline.model import Plane
 from pipeline.quality.validity import check_solid
-from pipeline.roof.floor_cut import cut_at_floor
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.solid import solid_parts
+from pipeline.roof.unsupported_faces import cut_at_floor
 
 FLOOR_M = 0.1
 

@@ -14,9 +14,11 @@ from pipeline.errors import BuildingError
 from pipeline.model import FaceKind, Reason
 from pipeline.quality.validity import check_solid
 from pipeline.roof.block import block_forms, block_plane
-from pipeline.roof.footprint import clip_partition, footprint_in_mm, hull_of_points, outline, simpler_outlines
+from pipeline.roof.footprint import hull_of_points, outline
+from pipeline.roof.footprint_in_mm import footprint_in_mm, simpler_outlines
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.solid import SolidPart
+from pipeline.roof.traced_forms import clip_partition
 
 SQUARE = RoofPartition(polygons=(shapely.box(0, 0, 10_000, 10_000),), labels=np.array([0], np.int32))
 PLANE = block_plane(np.full((3, 3), 5.0), 0.0, 50.0)

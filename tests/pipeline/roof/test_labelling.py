@@ -6,7 +6,8 @@ from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.roof.labelling import continue_crossings, empty_samples, fill_labels, nearest_points
+from pipeline.roof.labelling import continue_crossings, empty_samples, fill_labels
+from pipeline.roof.nearest_points import nearest_points
 from pipeline.tin.delaunay import triangulate
 
 

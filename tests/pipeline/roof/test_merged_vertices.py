@@ -9,9 +9,9 @@ from shapely import MultiPolygon
 from pipeline.model import FloatArray, IntArray
 from pipeline.roof.arrangement.arranging import arrange
 from pipeline.roof.arrangement.joined_planes import joined_planes
-from pipeline.roof.arrangement.limits import limits_at
 from pipeline.roof.arrangement.merged_vertices import merge_vertices, rings_with_merged
 from pipeline.roof.arrangement.movable_borders import Borders, edges_of_rings
+from pipeline.roof.arrangement.raster_labels import limits_at
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.settings import ArrangementSettings
 

@@ -17,14 +17,13 @@ from pipeline.errors import BuildingError
 from pipeline.model import IntArray, LabelArray, Plane, Reason, Solid, Tin
 from pipeline.prepared_cloud import prepare_cloud
 from pipeline.quality.validity import check_solid
-from pipeline.roof.floor_cut import cut_at_floor
 from pipeline.roof.partition import MinAreas, RoofPartition, absorb_small_regions, connected_regions, march
 from pipeline.roof.plan import partition_roof, roof_points
 from pipeline.roof.settings import RoofSettings
 from pipeline.roof.simplification import simplify_partition, unite_close_vertices
 from pipeline.roof.solid import solid_parts
 from pipeline.roof.traced_forms import plan_forms
-from pipeline.roof.unsupported_faces import level_unsupported_faces
+from pipeline.roof.unsupported_faces import cut_at_floor, level_unsupported_faces
 from pipeline.tin.delaunay import triangulate
 
 ExactRoofs = Callable[..., Any]

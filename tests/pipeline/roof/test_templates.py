@@ -19,7 +19,7 @@ from pipeline.extras.templates.shapes import best_shape, height, misfit, robust_
 from pipeline.extras.templates.template_drawing import lower_piece
 from pipeline.model import FloatArray, Plane, Reason, Solid
 from pipeline.quality.validity import check_solid
-from pipeline.roof.footprint import footprint_in_mm
+from pipeline.roof.footprint_in_mm import footprint_in_mm
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.solid import solid_parts
 

@@ -19,7 +19,7 @@ from pipeline.extras.classify.las_frame import read_frame
 from pipeline.io import open_source
 from pipeline.runtime.monitoring.progress import Event
 from pipeline.runtime.resources import SERIAL
-from pipeline.runtime.scratch.folder_lock import locked_folder, remove_abandoned
+from pipeline.runtime.scratch.abandoned import locked_folder, remove_abandoned
 
 Classify = Callable[..., ClassifySummary]
 NAMES = {1: "other", 2: "ground", 5: "vegetation", 6: "building", 7: "noise"}

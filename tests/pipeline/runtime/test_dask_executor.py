@@ -19,12 +19,13 @@ from pipeline.runtime.cluster import dispatch, worker_setup
 from pipeline.runtime.cluster.dask_executor import Cluster
 from pipeline.runtime.cluster.dispatch import ClusterMonitor
 from pipeline.runtime.cluster.local_executor import LocalExecutor
+from pipeline.runtime.cluster.packed_tasks import differences, measure_packed, pack_tasks, versions_of
 from pipeline.runtime.cluster.serial_executor import SerialExecutor
 from pipeline.runtime.engine import executor_for
 from pipeline.runtime.isolation.forked_child import can_fork
-from pipeline.runtime.monitoring.measurement import Measured, measure_packed, pack_tasks
+from pipeline.runtime.monitoring.measurement import Measured
 from pipeline.runtime.monitoring.progress import Event, Watch
-from pipeline.runtime.monitoring.versions import ENGINE, differences, fingerprint, versions_here, versions_of
+from pipeline.runtime.monitoring.versions import ENGINE, fingerprint, versions_here
 from pipeline.runtime.resources import Resources
 from pipeline.runtime.scratch.folder import Scratch
 

@@ -1,4 +1,4 @@
-"""What tiles finish and what they hand on give, joined, what a join of all their fragments gives."""
+"""What tiles finish and what they hand on give, joined, what one tile of everything gives."""
 
 import dataclasses
 import itertools
@@ -14,15 +14,15 @@ import pytest
 from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from slow_join import WholeSplit, whole_join, whole_surfaces
 from whole_scene import seen_m, split_alone
+from whole_surfaces import WholeSplit, whole_surfaces
 
 from pipeline.kernels.union_find import united
 from pipeline.model import IntArray, Tin
 from pipeline.ruler.simulation.dataset import simulate
 from pipeline.runtime.stages.border_facets import are_beyond, facet_names, shared_facets, united_by_name
-from pipeline.runtime.stages.join import join_tiles
 from pipeline.runtime.stages.open_fragments import open_fragments
+from pipeline.runtime.stages.rehearsal import join_tiles
 from pipeline.runtime.stages.sites import FoundSites
 from pipeline.runtime.stages.split import Split, SplitFigures
 from pipeline.scene import BUILDING_CLASS, GROUND_CLASS, WindowPoints
@@ -62,20 +62,15 @@ def handed_on(whole: WholeSplit, grid: TileGrid, cut: SurfaceSettings, judging: 
     return copy
 
 
-def both_joins(
+def joined(
     wholes: Sequence[WholeSplit], grid: TileGrid, cut: SurfaceSettings, judging: CandidateSettings
-) -> tuple[FoundSites, FoundSites]:
-    """The slow join of all fragments, and the join of what is handed on, in another order of the tiles.
-
-    Blocks of any size give the same: of all tiles, of two across, of one.
-    """
+) -> tuple[FoundSites, int]:
+    """The join of what is handed on: the same in any order of the tiles, and in blocks of all tiles, of two, of one."""
     handed = [handed_on(whole, grid, cut, judging) for whole in wholes]
-    slow, slow_small = whole_join(wholes, grid, judging, CRS)
-    found, small = join_tiles(reversed(handed), grid, judging, CRS)
-    assert small == slow_small
+    found = join_tiles(reversed(handed), grid, judging, CRS)
     for across in (1, 2):
-        assert join_tiles(handed, grid, judging, CRS, across) == (found, small)
-    return slow, found
+        assert join_tiles(handed, grid, judging, CRS, across) == found
+    return found
 
 
 def sorted_points(tile: Tile, fragments: Fragments, point_fragment: npt.NDArray[np.int32]) -> WholeSplit:
@@ -174,23 +169,16 @@ easy = st.sampled_from(
 
 
 @settings(max_examples=examples(30), deadline=None)
-@given(scene=patchworks, grid=grids, judging=easy, every=st.sampled_from([1, 1, 2]))
-def test_patches_of_many_levels_in_all_or_some_tiles_are_joined_as_by_the_slow_join(
-    scene: Patchwork, grid: TileGrid, judging: CandidateSettings, every: int
+@given(scene=patchworks, grid=grids, judging=easy)
+def test_neither_tiles_nor_blocks_nor_order_decide_what_is_found(
+    scene: Patchwork, grid: TileGrid, judging: CandidateSettings
 ) -> None:
-    slow, found = both_joins(scene.cut(grid)[::every], grid, CUT, judging)
-    assert found == slow
-
-
-@settings(max_examples=examples(12), deadline=None)
-@given(scene=patchworks, grid=grids)
-def test_the_tiles_do_not_decide_what_is_found(scene: Patchwork, grid: TileGrid) -> None:
     everything = TileGrid(size_mm=200_000, halo_mm=8_000, origin_x_mm=-90_000, origin_y_mm=-90_000)
-    (alone,) = [handed_on(whole, everything, CUT, EASY) for whole in scene.cut(everything)]
+    (alone,) = [handed_on(whole, everything, CUT, judging) for whole in scene.cut(everything)]
     waiting = alone.surfaces.open
     assert len(waiting.kind) == len(waiting.step_reach) == len(waiting.facets.names) == 0
-    whole, small = join_tiles([alone], everything, EASY, CRS)
-    cut, cut_small = join_tiles([handed_on(one, grid, CUT, EASY) for one in scene.cut(grid)], grid, EASY, CRS)
+    whole, small = join_tiles([alone], everything, judging, CRS)
+    cut, cut_small = joined(scene.cut(grid), grid, CUT, judging)
     counts = [Counter((c.building_id, c.points) for c in found.candidates) for found in (cut, whole)]
     assert counts[0] == counts[1]
     nowhere = [[dataclasses.replace(r, owner=Tile(0, 0), ranges=()) for r in found.rejected] for found in (cut, whole)]
@@ -226,94 +214,11 @@ def test_the_patches_have_what_the_join_is_for() -> None:
     assert min(seen.values()) >= 6, seen
 
 
-# -- fragments of any sums and links -----------------------------------------------------------------------------------
+# -- fragments by hand -------------------------------------------------------------------------------------------------
 
 CORNER = TileGrid(size_mm=20_000, halo_mm=8_000)
 """Facets around the origin lie where four tiles see them."""
 TILES = (Tile(-1, -1), Tile(-1, 0), Tile(0, -1), Tile(0, 0))
-KINDS = (
-    FacetKind.OBJECT,
-    FacetKind.OBJECT,
-    FacetKind.BUILDING,
-    FacetKind.CROWN,
-    FacetKind.STEP,
-    FacetKind.SEAM,
-    FacetKind.GROUND,
-)
-SHARES = (0, 1000, 6000, 12_000)
-
-
-def any_fragments(seed: int, most: int, facets: int) -> list[WholeSplit]:
-    """Four tiles with up to `most` fragments each, any of which may hold any of the facets of its kind, or none."""
-    random = np.random.default_rng(seed)
-    facet_kinds = random.choice(KINDS[:6], facets)
-    corners = random.integers(-800, 800, (facets, 2))
-    keys = np.column_stack([corners + shift for shift in ([0, 0], [150, 10], [20, 140])])
-    places = iter(random.permutation(4 * most + 1).tolist())
-    found = []
-    for tile in TILES:
-        count = int(random.integers(0, most + 1))
-        kind = random.choice(KINDS, count).astype(np.int8)
-        sums = np.zeros((count, N_SUMS), np.int64)
-        sums[:, Sum.FACETS] = random.integers(1, 60, count)
-        sums[:, Sum.AREA2] = random.choice([0, 5_000_000, 9_000_000, 30_000_000, 60_000_000], count)
-        sums[:, Sum.VERTICES] = random.integers(1, 30, count)
-        sums[:, Sum.HEIGHT] = sums[:, Sum.VERTICES] * random.choice([1500, 4000], count, p=[0.2, 0.8])
-        sums[:, Sum.PLANAR], sums[:, Sum.ROUGH] = random.choice([0, 5, 20], count), random.choice([0, 5], count)
-        sums[:, Sum.BOUNDARY] = 12_000
-        sums[:, Sum.POINTS] = random.choice([1, 20, 200], count)
-        sums[:, Sum.SEVERAL] = sums[:, Sum.POINTS] * random.choice([0, 0.1, 0.5], count)
-        sums[:, Sum.THROUGH] = sums[:, Sum.SEVERAL] // 2
-        for column in (Sum.WALL, Sum.WALL_TOP, Sum.STEP, Sum.SEAM):
-            sums[:, column] = random.choice(SHARES, count)
-        low = random.integers(-9000, 9000, (count, 2))
-        boxes = np.column_stack((low, low + random.integers(0, 6000, (count, 2))))
-        empty = random.random(count) < 0.1
-        boxes[empty] = [NOWHERE, NOWHERE, -NOWHERE, -NOWHERE]
-        points = np.column_stack((low, [next(places) for _ in range(count)])).reshape(count, 3).astype(np.int64)
-        held = np.flatnonzero(random.random(count) < 0.8)
-        points[np.setdiff1d(np.arange(count), held)] = NOWHERE
-        solid, steps = np.flatnonzero(np.isin(kind, SOLID)), np.flatnonzero(np.isin(kind, CONNECTING))
-        links = int(random.integers(0, 2 * most)) if len(solid) and len(steps) else 0
-        ends = [random.choice(which, links) if links else np.empty(0) for which in (solid, steps)]
-        along = np.column_stack((*ends, random.integers(1, 900, links)))
-        holders = [
-            (facet, random.choice(same))
-            for facet in range(facets)
-            if random.random() < 0.6 and len(same := np.flatnonzero(kind == facet_kinds[facet]))
-        ]
-        crossing = np.array(holders, np.int64).reshape(-1, 2)
-        found.append(
-            WholeSplit(
-                tile=tile,
-                fragments=Fragments(
-                    kind=kind,
-                    sums=sums,
-                    boxes_mm=boxes.reshape(count, 4),
-                    lowest_point_mm=points,
-                    crossing_keys=keys[crossing[:, 0]],
-                    crossing_fragment=crossing[:, 1].astype(np.int32),
-                    along_steps=along.astype(np.int64),
-                ),
-                keys=held.astype(np.int64),
-                starts=np.append(0, np.cumsum(random.integers(1, 50, len(held)))).astype(np.int64),
-            )
-        )
-    return found
-
-
-@settings(max_examples=examples(150), deadline=None)
-@given(
-    seed=st.integers(0, 10**9),
-    most=st.integers(1, 14),
-    facets=st.integers(0, 12),
-    judging=st.sampled_from([EASY, CandidateSettings(), dataclasses.replace(EASY, unite_reach_m=0.0)]),
-)
-def test_fragments_of_any_sums_and_links_are_joined_as_by_the_slow_join(
-    seed: int, most: int, facets: int, judging: CandidateSettings
-) -> None:
-    slow, found = both_joins(any_fragments(seed, most, facets), CORNER, CUT, judging)
-    assert found == slow
 
 
 def by_hand(tile: Tile, kinds: list[int], facets: list[tuple[int, int]], along: list[tuple[int, int]]) -> WholeSplit:
@@ -348,10 +253,9 @@ def test_a_step_unites_roofs_of_two_tiles_through_a_third_in_which_nothing_lies_
     west = by_hand(TILES[0], [roof, step], [(0, 1)], [(0, 1)])
     east = by_hand(TILES[3], [roof, step], [(1, 1)], [(0, 1)])
     middle = by_hand(TILES[1], [step], [(0, 0), (1, 0)], [])
-    slow, found = both_joins([west, middle, east], CORNER, CUT, EASY)
-    assert found == slow
+    found, _ = joined([west, middle, east], CORNER, CUT, EASY)
     assert [len(site.ranges) for site in found.candidates] == [2]
-    _, without = both_joins([west, east], CORNER, CUT, EASY)
+    without, _ = joined([west, east], CORNER, CUT, EASY)
     assert [len(site.ranges) for site in without.candidates] == [1, 1]
 
 
@@ -364,7 +268,7 @@ def test_no_tiles_have_no_sites() -> None:
 
 @pytest.mark.parametrize(("suite", "seed"), [("town", 5), ("city", 1)])
 @pytest.mark.parametrize("classes", [ClassesInUse(), ClassesInUse(ground=True, building=True)])
-def test_towns_in_tiny_tiles_are_joined_as_by_the_slow_join(
+def test_towns_in_tiny_tiles_of_any_size_have_the_same_candidates(
     suite: str, seed: int, classes: ClassesInUse, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     """Rows of touching houses at several levels, over many tiles of 20 to 40 m."""
@@ -392,8 +296,7 @@ def test_towns_in_tiny_tiles_are_joined_as_by_the_slow_join(
             inside = points.take(np.flatnonzero(window.contains(x, y)))
             found = split_alone(inside, grid.core(tile), window, scene, classes)
             wholes.append(sorted_points(tile, found.fragments, found.point_fragment))
-        slow, new = both_joins(wholes, grid, scene.surfaces, scene.candidates)
-        assert new == slow
+        new, _ = joined(wholes, grid, scene.surfaces, scene.candidates)
         assert len(new.candidates) > 5
         assert any(len({part.tile for part in site.ranges}) > 2 for site in new.candidates)
         sites.append([(c.building_id, c.points) for c in new.candidates])

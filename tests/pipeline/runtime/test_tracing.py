@@ -11,7 +11,7 @@ from trace_receiver import collecting
 from traced import Spans, id_of, parent_of, spans, trace_of
 
 from pipeline.model import Reason
-from pipeline.runtime.monitoring import traces, tracing
+from pipeline.runtime.monitoring import measurement, tracing
 from pipeline.runtime.monitoring.measurement import Measured
 from pipeline.runtime.monitoring.progress import Progress
 from pipeline.runtime.monitoring.tracing import Parent
@@ -27,10 +27,10 @@ ABOVE = Parent(trace_id=0xA, span_id=0xB, is_sampled=True)
 @pytest.fixture
 def fresh() -> Iterator[None]:
     """What was read from the environment is read again."""
-    for cached in (tracing.is_on, traces.slow_building_s):
+    for cached in (tracing.is_on, measurement.slow_building_s):
         cached.cache_clear()
     yield
-    for cached in (tracing.is_on, traces.slow_building_s):
+    for cached in (tracing.is_on, measurement.slow_building_s):
         cached.cache_clear()
 
 
@@ -71,7 +71,7 @@ assert "pipeline.runtime.run" in sys.modules
 def test_the_variables_of_the_standard_turn_traces_on(
     fresh: None, monkeypatch: pytest.MonkeyPatch, variables: dict[str, str], on: bool
 ) -> None:
-    for name in (*traces.ENDPOINTS, "OTEL_SDK_DISABLED", "OTEL_TRACES_EXPORTER"):
+    for name in (*measurement.ENDPOINTS, "OTEL_SDK_DISABLED", "OTEL_TRACES_EXPORTER"):
         monkeypatch.delenv(name, raising=False)
     for name, value in variables.items():
         monkeypatch.setenv(name, value)
@@ -98,7 +98,8 @@ def test_a_header_comes_back_as_it_was() -> None:
 
 def test_a_stage_has_its_tiles_and_a_tile_its_parts(spans: Spans) -> None:
     progress = Progress(lambda _event: None)
-    part = traces.Part(name="building", began_s=101.0, ended_s=102.5, error="timed_out", facts={"building_id": "b"})
+    facts = {"building_id": "b"}
+    part = measurement.Part(name="building", began_s=101.0, ended_s=102.5, error="timed_out", facts=facts)
     found = Measured(result=1, seconds=4.0, cpu_s=1.0, began_s=100.0, process="far:7", peak_bytes=5, tile="0_0")
     with tracing.span("attempt", parent=ABOVE), progress.stage("reconstruct", 3):
         progress.measured(found, lambda: [part])
@@ -158,7 +159,7 @@ def test_only_slow_buildings_and_lost_ones_get_spans(fresh: None, monkeypatch: p
     assert (slow.began_s, slow.ended_s, slow.error) == (998.0, 1000.0, None)
     assert gone.error == "timed_out"
     monkeypatch.setenv("GABLEWORK_TRACE_BUILDING_S", "0.3")
-    traces.slow_building_s.cache_clear()
+    measurement.slow_building_s.cache_clear()
     assert [part.facts["building_id"] for part in _traced(some)] == ["quick", "slow", "lost"]
 
 
@@ -167,7 +168,7 @@ def test_a_limit_for_buildings_that_makes_no_sense_costs_a_warning(
     fresh: None, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, text: str
 ) -> None:
     monkeypatch.setenv("GABLEWORK_TRACE_BUILDING_S", text)
-    assert traces.slow_building_s() == traces.SLOW_BUILDING_S
+    assert measurement.slow_building_s() == measurement.SLOW_BUILDING_S
     assert f"GABLEWORK_TRACE_BUILDING_S is {text!r}" in caplog.text
 
 

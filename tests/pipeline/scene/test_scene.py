@@ -10,8 +10,8 @@ import numpy.typing as npt
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from slow_join import WholeSplit, whole_surfaces
 from whole_scene import WholeScene, seen_m, split_alone
+from whole_surfaces import WholeSplit, whole_surfaces
 
 from pipeline.model import IntArray
 from pipeline.scene import WindowPoints, lattice_of
@@ -429,7 +429,7 @@ def test_every_stage_widens_the_support() -> None:
 
 
 def described(tile: Tile, found: WholeScene) -> WholeSplit:
-    """What the slow join reads of a split."""
+    """What is united of a split."""
     return WholeSplit(tile=tile, fragments=found.fragments, starts=np.zeros(1, np.int64), keys=np.empty(0, np.int64))
 
 

@@ -12,13 +12,8 @@ from hypothesis import strategies as st
 from pipeline.errors import SettingsError
 from pipeline.geometry import nearest_neighbours, point_spacing_m
 from pipeline.model import FloatArray, IntArray, LabelArray
-from pipeline.segmentation.adaptive_planes import (
-    DetectedPlanes,
-    detect_planes,
-    mean_nodes,
-    merge_by_f_test,
-    noise_about,
-)
+from pipeline.segmentation.adaptive_planes import DetectedPlanes, detect_planes, merge_by_f_test, noise_about
+from pipeline.segmentation.mean_nodes import mean_nodes
 from pipeline.segmentation.plane_regression import cluster_sums
 from pipeline.segmentation.plane_settings import AdaptivePlaneSettings
 from pipeline.segmentation.trial_regions import TrialLimits, local_planes, noise_of_local_planes, take_regions

@@ -12,7 +12,7 @@ from pipeline.geometry import nearest_neighbours
 from pipeline.model import FloatArray, LabelArray, Reason
 from pipeline.segmentation.plane_refinement import refine_planes
 from pipeline.segmentation.plane_regression import describe_planes
-from pipeline.segmentation.plane_settings import PlaneRefinementSettings
+from pipeline.segmentation.refinement_settings import PlaneRefinementSettings
 
 
 def gable(seed: int = 0, count: int = 400, noise: float = 0.03, rise: float = 0.5) -> tuple[FloatArray, LabelArray]:

@@ -7,10 +7,10 @@ import pytest
 
 from pipeline.geometry import nearest_neighbours
 from pipeline.model import BoolArray, FloatArray, LabelArray
+from pipeline.segmentation.plane_refinement import nearest_plane
 from pipeline.segmentation.point_assignment import (
     dissolve_redundant,
     distance_to_plane,
-    nearest_plane,
     touching_pairs,
     vote_among_neighbours,
 )

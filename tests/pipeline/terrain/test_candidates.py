@@ -1,13 +1,10 @@
 """Whole surfaces are judged by hand-made sums; levels unite whatever their numbers."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from slow_join import slowly_judged, slowly_united
 
 from pipeline.errors import SettingsError
 from pipeline.model import IntArray, Reason
@@ -262,8 +259,7 @@ def test_many_surfaces_are_judged_like_each_on_its_own(
     found = judge_surfaces(surfaces, SETTINGS)
     for k, kind in enumerate(kinds[: len(rows)]):
         if kind in {FacetKind.OBJECT, FacetKind.BUILDING, FacetKind.CROWN}:
-            verdict = slowly_judged(kind, surfaces.sums[k], SETTINGS)
-            assert judge_surface(kind, surfaces.sums[k], SETTINGS) == verdict
+            verdict = judge_surface(kind, surfaces.sums[k], SETTINGS)
             if verdict is None:
                 assert found[k] == (Fault.NONE if somewhere[k] else Fault.NOT_JUDGED)
             else:
@@ -365,20 +361,6 @@ link_lists = st.lists(st.tuples(st.integers(0, 6), st.integers(0, 3)), max_size=
 
 def is_solid(kind: int) -> bool:
     return kind not in {FacetKind.STEP, FacetKind.GROUND}
-
-
-@settings(deadline=None, max_examples=examples(200))
-@given(members=scenes, links=link_lists)
-def test_uniting_agrees_with_a_slow_twin(
-    members: list[tuple[int, int, int, FacetKind]], links: list[tuple[int, int]]
-) -> None:
-    surfaces = drawn(members, links)
-    verdicts = [
-        slowly_judged(kind, sums, SETTINGS) if is_solid(kind) else Verdict(reason=Reason.TOO_FEW_POINTS, detail="")
-        for kind, sums in zip(surfaces.kind.tolist(), surfaces.sums, strict=True)
-    ]
-    with_lengths = dataclasses.replace(surfaces, along_steps=np.pad(surfaces.along_steps, ((0, 0), (0, 1))))
-    assert leaders(surfaces) == slowly_united(with_lengths, verdicts, SETTINGS).tolist()
 
 
 @settings(deadline=None, max_examples=examples(200))

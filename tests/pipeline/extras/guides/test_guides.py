@@ -20,7 +20,7 @@ from pipeline.model import FloatArray, Guide, GuideKind
 from pipeline.roof.arrangement.arranging import arrange
 from pipeline.roof.arrangement.candidate_lines import CandidateLines
 from pipeline.roof.arrangement.guide_lines import NO_GUIDES, Guides, with_guides
-from pipeline.roof.footprint import footprint_in_mm
+from pipeline.roof.footprint_in_mm import footprint_in_mm
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.settings import ArrangementSettings
 

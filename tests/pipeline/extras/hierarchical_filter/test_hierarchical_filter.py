@@ -12,7 +12,8 @@ from pipeline.errors import SettingsError
 from pipeline.extras.hierarchical_filter.hierarchical_filter import _lowest_of_cells, _without_clumps, join_planes
 from pipeline.extras.hierarchical_filter.tin_densification import join_facets
 from pipeline.terrain.ground import Terrain, ground_of
-from pipeline.terrain.lattice import NO_DATA, without_pits
+from pipeline.terrain.lattice import NO_DATA
+from pipeline.terrain.pits import without_pits
 from pipeline.terrain.planar_fitting import plane_around, plane_sums
 from pipeline.terrain.settings import GroundSettings
 

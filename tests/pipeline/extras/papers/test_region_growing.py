@@ -7,7 +7,7 @@ from pipeline.errors import BuildingError, SettingsError
 from pipeline.extras.papers.region_growing import grow_regions
 from pipeline.geometry import nearest_neighbours
 from pipeline.model import FloatArray, LabelArray, Reason
-from pipeline.segmentation.plane_settings import RegionGrowingSettings
+from pipeline.segmentation.refinement_settings import RegionGrowingSettings
 
 
 def gable(seed: int = 0, noise: float = 0.03) -> tuple[FloatArray, LabelArray]:
