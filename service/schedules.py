@@ -11,8 +11,6 @@ from service.jobs import JobRequest
 
 OUTCOMES = (Outcome.SUBMITTED, Outcome.WAITING, Outcome.SKIPPED, Outcome.MISSED, Outcome.FAILED)
 """The possible outcomes of a slot of the service, or of a run by hand."""
-COUNTED = tuple(outcome for outcome in OUTCOMES if outcome is not Outcome.WAITING)
-"""Outcomes that are final."""
 
 
 class Trigger(StrEnum):

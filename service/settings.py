@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import ipaddress
 import re
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 from urllib.parse import urlsplit
@@ -14,12 +16,24 @@ from pydantic import Field, ValidationInfo, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from service.errors import StartUpError
-from service.jobs import QueueLimits
 
 if TYPE_CHECKING:
     from pipeline.runtime.resources import Resources
 
 _GIB = 2**30
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class QueueLimits:
+    """How many jobs may wait; running ones do not count."""
+
+    max_queued: int = sys.maxsize
+    """All jobs."""
+    max_queued_per_key: int = sys.maxsize
+    """Jobs of one key."""
+
+
+UNLIMITED = QueueLimits()
 
 
 class ServiceSettings(BaseSettings):

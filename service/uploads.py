@@ -257,13 +257,13 @@ def remove_file(upload_id: str, folder: StateFolder) -> None:
     shutil.rmtree(folder.upload(upload_id), ignore_errors=True)
 
 
-def remove_leftovers(folder: StateFolder, *, now_s: float, stale_s: float = STALE_S) -> list[Path]:
+def remove_leftovers(folder: StateFolder, *, now_s: float) -> list[Path]:
     """Remove the temporary folders that a dead process left behind; returns them. `now_s` counts from the epoch."""
     removed = []
     for path in folder.uploads.glob(f"{TEMPORARY}*"):
         with contextlib.suppress(FileNotFoundError):
             newest_s = max(entry.stat().st_mtime for entry in (path, *path.iterdir()))
-            if now_s - newest_s > stale_s:
+            if now_s - newest_s > STALE_S:
                 shutil.rmtree(path, ignore_errors=True)
                 removed.append(path)
     return removed

@@ -45,7 +45,6 @@ NEXT_TIMES = 5
 
 ScheduleId = Annotated[str, Path(alias="scheduleID", description="As in the schedule itself.", examples=[SCHEDULE_ID])]
 
-_PATCH = {"schema": reference(wire.SchedulePatch)}
 _TAG = header("ETag", "The version, for If-Match.")
 
 

@@ -12,13 +12,12 @@ from sqlalchemy.engine import Connection
 
 from service import traces
 from service.errors import LeaseLostError
-from service.files import is_id
 from service.jobs import Job, JobEvent, JobStatus, LogLevel, NewLogLine
 from service.store import logs
 from service.store.database import after_commit
 from service.store.outbox import announce
 from service.store.policies import duration_ms
-from service.store.records import job_of, storable
+from service.store.records import job_of, row_by_id, storable
 from service.store.tables import EVENTS, JOBS
 from service.webhooks import EVENT_OF, EventType
 
@@ -29,7 +28,7 @@ _LASTING = ("status", "progress")
 
 def lock_job(connection: Connection, job_id: str) -> sa.Row[Any] | None:
     """A job's row, locked until the transaction ends; None if there is no such job."""
-    return _row(connection, job_id, locked=True)
+    return row_by_id(connection, JOBS, job_id, locked=True)
 
 
 def lock_held(connection: Connection, held: Job) -> sa.Row[Any]:
@@ -51,7 +50,7 @@ def held_row(connection: Connection, held: Job, *, locked: bool = False) -> sa.R
     LeaseLostError
         The job is over, gone, or held by another driver or for another attempt.
     """
-    row = _row(connection, held.job_id, locked=locked)
+    row = row_by_id(connection, JOBS, held.job_id, locked=locked)
     if row is None:
         raise LeaseLostError(f"job {held.job_id} is gone")
     if row.status != JobStatus.RUNNING or row.lease_owner != held.lease_owner or row.attempt != held.attempt:
@@ -61,13 +60,6 @@ def held_row(connection: Connection, held: Job, *, locked: bool = False) -> sa.R
             f"the job is {row.status} at attempt {row.attempt}{by}"
         )
     return row
-
-
-def _row(connection: Connection, job_id: str, *, locked: bool) -> sa.Row[Any] | None:
-    if not is_id(job_id):
-        return None
-    one = sa.select(JOBS).where(JOBS.c.job_id == job_id)
-    return connection.execute(one.with_for_update() if locked else one).one_or_none()
 
 
 def move(

@@ -15,7 +15,7 @@ from pipeline.backoff import Backoff
 from service.receivers import Avoided, Due
 from service.store.database import LOCK_SECRETS, StorePart, lock
 from service.store.outbox import drop
-from service.store.records import delivery_of, storable
+from service.store.records import from_row, storable
 from service.store.tables import WEBHOOK_ATTEMPTS, WEBHOOK_DELIVERIES, WEBHOOK_EVENTS, WEBHOOKS
 from service.store.webhook_secrets import own_secret
 from service.webhooks import Delivery, DeliveryState, EventType, Parcel, Result, job_of, verdict
@@ -146,7 +146,7 @@ def _take(
         endpoint = endpoints.get(row.endpoint_id)
         parcels.append(
             Parcel(
-                delivery=dataclasses.replace(delivery_of(row), attempts=row.attempts + 1),
+                delivery=dataclasses.replace(from_row(Delivery, row), attempts=row.attempts + 1),
                 driver=name,
                 job=jobs[row.event_id],
                 base=row.base,

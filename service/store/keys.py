@@ -6,7 +6,7 @@ import sqlalchemy as sa
 
 from service.keys import Key
 from service.store.database import StorePart
-from service.store.records import key_of, storable
+from service.store.records import from_row, storable
 from service.store.tables import KEYS
 
 
@@ -32,13 +32,13 @@ class KeyTable(StorePart):
         held = sa.or_(KEYS.c.digest == storable(digest), KEYS.c.old_digest == storable(digest))
         with self._database.read() as connection:
             row = connection.execute(sa.select(KEYS).where(held)).one_or_none()
-        return None if row is None else key_of(row)
+        return None if row is None else from_row(Key, row)
 
     def keys(self) -> list[Key]:
         """All keys, also revoked ones, oldest first."""
         with self._database.read() as connection:
             rows = connection.execute(sa.select(KEYS).order_by(KEYS.c.created_at, KEYS.c.key_id))
-            return [key_of(row) for row in rows]
+            return [from_row(Key, row) for row in rows]
 
     def rotate_key(self, key: Key) -> None:
         """Store the new secret of a key."""

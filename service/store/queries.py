@@ -16,7 +16,7 @@ from service.errors import NoSuchJobError
 from service.files import is_id
 from service.jobs import Job, JobEvent, JobStatus, LogLevel, LogLine
 from service.store.database import StorePart
-from service.store.records import event_of, job_of, log_line_of, storable
+from service.store.records import from_row, job_of, log_line_of, storable
 from service.store.tables import EVENTS, JOBS, LOG_LINES
 
 _ASKED_AT_ONCE = 512
@@ -106,7 +106,8 @@ class JobQueries(StorePart):
             return []
         later = sa.select(EVENTS).where(EVENTS.c.job_id == job_id, EVENTS.c.sequence > max(0, min(after, _LAST)))
         with self._database.read() as connection:
-            return [event_of(row) for row in connection.execute(later.order_by(EVENTS.c.sequence).limit(limit))]
+            found = connection.execute(later.order_by(EVENTS.c.sequence).limit(limit))
+            return [from_row(JobEvent, row) for row in found]
 
     def log(
         self,

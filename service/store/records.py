@@ -8,10 +8,10 @@ from typing import Any, TypeVar
 
 import sqlalchemy as sa
 from pydantic import TypeAdapter
+from sqlalchemy.engine import Connection
 
-from service.jobs import Fault, Job, JobEvent, JobFailure, JobRequest, LogLine, Upload
-from service.keys import Key
-from service.webhooks import Delivery, Endpoint
+from service.files import is_id
+from service.jobs import Fault, Job, JobFailure, JobRequest, LogLine
 
 Record = TypeVar("Record")
 
@@ -32,6 +32,15 @@ def from_row(kind: Callable[..., Record], row: sa.Row[Any], **values: Any) -> Re
     return found
 
 
+def row_by_id(connection: Connection, table: sa.Table, name: str, *, locked: bool = False) -> sa.Row[Any] | None:
+    """The row with an id of ours, with `locked` until the transaction ends; None if there is none."""
+    if not is_id(name):
+        return None
+    (column,) = table.primary_key.columns
+    one = sa.select(table).where(column == name)
+    return connection.execute(one.with_for_update() if locked else one).one_or_none()
+
+
 @functools.cache
 def _adapter(kind: Any) -> TypeAdapter[Any]:
     return TypeAdapter(kind)
@@ -43,31 +52,6 @@ def job_of(row: sa.Row[Any]) -> Job:
     return from_row(Job, row, request=JobRequest.from_dict(row.request), failure=failure)
 
 
-def event_of(row: sa.Row[Any]) -> JobEvent:
-    """A row of `job_events`."""
-    return from_row(JobEvent, row)
-
-
 def log_line_of(row: sa.Row[Any]) -> LogLine:
     """A row of `job_log`."""
     return from_row(LogLine, row, facts=row.facts or {})
-
-
-def upload_of(row: sa.Row[Any]) -> Upload:
-    """A row of `uploads`."""
-    return from_row(Upload, row)
-
-
-def key_of(row: sa.Row[Any]) -> Key:
-    """A row of `keys`."""
-    return from_row(Key, row)
-
-
-def endpoint_of(row: sa.Row[Any]) -> Endpoint:
-    """A row of `webhooks`."""
-    return from_row(Endpoint, row)
-
-
-def delivery_of(row: sa.Row[Any]) -> Delivery:
-    """A row of `webhook_deliveries`, without the log of its attempts."""
-    return from_row(Delivery, row)

@@ -16,12 +16,13 @@ from pipeline.errors import SettingsError
 from pipeline.schedule import Cron, Outcome, Rules, decided_by, enter, look, miss_passed
 from service.deliveries import Delivery
 from service.errors import ChangedMeanwhileError, TooManySchedulesError
-from service.jobs import UNLIMITED, Job, QueueLimits
+from service.jobs import Job
 from service.schedules import Definition, Schedule, ScheduleRun
+from service.settings import UNLIMITED, QueueLimits
 from service.store import queries, schedules, ticks
 from service.store.database import LOCK_SUBMISSIONS, StorePart, lock
-from service.store.records import storable
-from service.store.schedules import COLUMN_OF, last_runs, row_of, run_of, schedule_of
+from service.store.records import from_row, storable
+from service.store.schedules import COLUMN_OF, last_runs, row_of, schedule_of
 from service.store.slot_book import SlotBook
 from service.store.submissions import hold_uploads
 from service.store.tables import SCHEDULE_RUNS, SCHEDULE_UPLOADS, SCHEDULES
@@ -206,7 +207,7 @@ class ScheduleStore(StorePart):
             row_of(connection, schedule_id, owner)
             chosen = sa.select(SCHEDULE_RUNS).where(SCHEDULE_RUNS.c.schedule_id == schedule_id)
             ordered = chosen.order_by(SCHEDULE_RUNS.c.number.desc()).limit(limit).offset(offset)
-            return [run_of(row) for row in connection.execute(ordered)]
+            return [from_row(ScheduleRun, row) for row in connection.execute(ordered)]
 
     def run_now(
         self,

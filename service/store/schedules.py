@@ -9,9 +9,9 @@ from sqlalchemy.engine import Connection
 
 from pipeline.schedule import Cron, Missed, Outcome, Overlap
 from service.errors import NoSuchScheduleError
-from service.files import is_id
 from service.jobs import JobRequest, JobStatus
-from service.schedules import Definition, Schedule, ScheduleRun, Trigger
+from service.schedules import Definition, Schedule, ScheduleRun
+from service.store.records import from_row, row_by_id
 from service.store.tables import JOBS, SCHEDULE_RUNS, SCHEDULES
 
 COLUMN_OF = {
@@ -81,11 +81,6 @@ def schedule_of(row: sa.Row[Any], last_run: ScheduleRun | None = None) -> Schedu
     )
 
 
-def run_of(row: sa.Row[Any]) -> ScheduleRun:
-    """A row of `schedule_runs`."""
-    return ScheduleRun(**row._asdict() | {"trigger": Trigger(row.trigger), "outcome": Outcome(row.outcome)})
-
-
 def row_of(connection: Connection, schedule_id: str, owner: str | None, *, locked: bool = False) -> sa.Row[Any]:
     """A schedule's row; `locked` until the transaction ends.
 
@@ -94,10 +89,7 @@ def row_of(connection: Connection, schedule_id: str, owner: str | None, *, locke
     NoSuchScheduleError
         It does not exist, or belongs to another key.
     """
-    one = sa.select(SCHEDULES).where(SCHEDULES.c.schedule_id == schedule_id)
-    row = None
-    if is_id(schedule_id):
-        row = connection.execute(one.with_for_update() if locked else one).one_or_none()
+    row = row_by_id(connection, SCHEDULES, schedule_id, locked=locked)
     if row is None or (owner is not None and row.owner != owner):
         raise NoSuchScheduleError(f"there is no schedule {schedule_id[:64]!r}")
     return row
@@ -114,4 +106,4 @@ def last_runs(connection: Connection, schedule_ids: list[str]) -> dict[str, Sche
     )
     same = sa.and_(SCHEDULE_RUNS.c.schedule_id == latest.c.schedule_id, SCHEDULE_RUNS.c.number == latest.c.number)
     found = connection.execute(sa.select(SCHEDULE_RUNS).join(latest, same))
-    return {row.schedule_id: run_of(row) for row in found}
+    return {row.schedule_id: from_row(ScheduleRun, row) for row in found}

@@ -12,7 +12,8 @@ from sqlalchemy.engine import Connection
 from pipeline.runtime.monitoring import tracing
 from service.deliveries import Delivery
 from service.errors import NoSuchUploadError, QueueFullError, ResultNotReadyError
-from service.jobs import UNLIMITED, Job, JobRequest, JobStatus, QueueLimits
+from service.jobs import Job, JobRequest, JobStatus
+from service.settings import UNLIMITED, QueueLimits
 from service.store.changes import lock_job, move, note_status
 from service.store.database import LOCK_SUBMISSIONS, lock
 from service.store.policies import lease_expired

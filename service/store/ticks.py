@@ -14,10 +14,11 @@ from sqlalchemy.engine import Connection
 from pipeline.errors import SettingsError
 from pipeline.schedule import PUT_BACK, Entry, Outcome, ScheduleState, decided_by, enter, look
 from service.errors import ForbiddenError, ScheduleBusyError, ServiceError
-from service.jobs import QueueLimits
+from service.keys import Key
 from service.schedules import Schedule, ScheduleRun, Trigger
+from service.settings import QueueLimits
 from service.store import schedules
-from service.store.records import key_of
+from service.store.records import from_row
 from service.store.slot_book import SlotBook
 from service.store.submissions import check_queue, insert
 from service.store.tables import KEYS, SCHEDULES
@@ -107,7 +108,7 @@ def _submit(connection: Connection, schedule: Schedule, now: dt.datetime, limits
     owner = schedule.owner
     if owner is not None:
         row = connection.execute(sa.select(KEYS).where(KEYS.c.key_id == owner)).one_or_none()
-        key = None if row is None else key_of(row)
+        key = None if row is None else from_row(Key, row)
         fault = None if key is None else key.fault(key.digest, now)
         if key is not None and fault is not None:
             raise ForbiddenError(

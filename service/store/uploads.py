@@ -15,7 +15,7 @@ from service.files import is_id
 from service.jobs import JobStatus, Upload
 from service.store import idempotency
 from service.store.database import LOCK_SUBMISSIONS, Database, StorePart, lock
-from service.store.records import storable, upload_of
+from service.store.records import from_row, row_by_id, storable
 from service.store.tables import JOB_UPLOADS, JOBS, SCHEDULE_UPLOADS, UPLOADS
 
 _NOT_OVER = [status.value for status in JobStatus if not status.is_over]
@@ -54,14 +54,11 @@ class UploadTable(StorePart):
         NoSuchUploadError
             It does not exist, or belongs to another key.
         """
-        one = sa.select(UPLOADS).where(UPLOADS.c.upload_id == upload_id)
-        row = None
-        if is_id(upload_id):
-            with self._database.read() as connection:
-                row = connection.execute(one).one_or_none()
+        with self._database.read() as connection:
+            row = row_by_id(connection, UPLOADS, upload_id)
         if row is None or (owner is not None and row.owner != owner):
             raise NoSuchUploadError(f"there is no upload {upload_id[:64]!r} (any more)")
-        return upload_of(row)
+        return from_row(Upload, row)
 
     def list_uploads(self, *, owner: str | None = None, limit: int, offset: int = 0) -> list[Upload]:
         """Uploads, newest first; with an owner only its own."""
@@ -69,7 +66,7 @@ class UploadTable(StorePart):
         if owner is not None:
             chosen = chosen.where(UPLOADS.c.owner == owner)
         with self._database.read() as connection:
-            return [upload_of(row) for row in connection.execute(chosen.limit(limit).offset(offset))]
+            return [from_row(Upload, row) for row in connection.execute(chosen.limit(limit).offset(offset))]
 
     def remove_upload(self, upload_id: str) -> None:
         """Delete an upload; the caller removes its file afterwards. One that does not exist is ignored.
@@ -116,7 +113,7 @@ class UploadTable(StorePart):
         )
         old = sa.select(UPLOADS).where(UPLOADS.c.expires_at <= now, ~needed, ~planned).order_by(UPLOADS.c.expires_at)
         with self._database.read() as connection:
-            return [upload_of(row) for row in connection.execute(old)]
+            return [from_row(Upload, row) for row in connection.execute(old)]
 
     def upload_ids(self) -> set[str]:
         """Ids of all uploads."""

@@ -14,11 +14,10 @@ from sqlalchemy.engine import Connection
 
 from service import deliveries as deliveries_of_requests
 from service.errors import NoSuchDeliveryError, NoSuchWebhookError, NotReplayableError, TooManyWebhooksError
-from service.files import is_id
 from service.store.database import LOCK_SECRETS, LOCK_SUBMISSIONS, lock
 from service.store.delivery_line import REMOVED, DeliveryLine, closed, endpoints_of
 from service.store.outbox import drop
-from service.store.records import delivery_of, endpoint_of, storable
+from service.store.records import from_row, row_by_id, storable
 from service.store.tables import WEBHOOK_ATTEMPTS, WEBHOOK_DELIVERIES, WEBHOOK_EVENTS, WEBHOOKS
 from service.store.uploads import creating
 from service.store.webhook_secrets import known_secret, own_secret, replace_own_secret
@@ -122,7 +121,7 @@ class WebhookStore(DeliveryLine):
                 "changed_at": now,
             }
             connection.execute(sa.insert(WEBHOOKS).values(**values))
-            return made((endpoint_of(_endpoint_row(connection, endpoint_id)), secret))
+            return made((from_row(Endpoint, _endpoint_row(connection, endpoint_id)), secret))
 
     def get(self, endpoint_id: str) -> Endpoint:
         """One endpoint.
@@ -133,13 +132,13 @@ class WebhookStore(DeliveryLine):
             It does not exist.
         """
         with self._database.read() as connection:
-            return endpoint_of(_endpoint_row(connection, endpoint_id))
+            return from_row(Endpoint, _endpoint_row(connection, endpoint_id))
 
     def list(self, *, limit: int = 100, offset: int = 0) -> builtins.list[Endpoint]:
         """Endpoints, newest first."""
         chosen = sa.select(WEBHOOKS).order_by(WEBHOOKS.c.created_at.desc(), WEBHOOKS.c.endpoint_id.desc())
         with self._database.read() as connection:
-            return [endpoint_of(row) for row in connection.execute(chosen.limit(limit).offset(offset))]
+            return [from_row(Endpoint, row) for row in connection.execute(chosen.limit(limit).offset(offset))]
 
     def replay_all(self, endpoint_id: str) -> Endpoint:
         """Send all that waits for an endpoint, and the ends of jobs that failed or were dropped; enable it.
@@ -160,7 +159,7 @@ class WebhookStore(DeliveryLine):
             connection.execute(sa.update(WEBHOOKS).where(one).values(**enabled))
             again = sa.update(WEBHOOK_DELIVERIES).where(own, sa.or_(waiting, ends))
             connection.execute(again.values(**_again(now), url=row.url))
-            return endpoint_of(_endpoint_row(connection, endpoint_id))
+            return from_row(Endpoint, _endpoint_row(connection, endpoint_id))
 
     def remove(self, endpoint_id: str) -> None:
         """Delete an endpoint, and drop what waits; the log stays.
@@ -208,7 +207,7 @@ class WebhookStore(DeliveryLine):
             chosen = chosen.where(_TABLE.state == criteria.state.value)
         with self._database.read() as connection:
             found = connection.execute(chosen.limit(criteria.limit).offset(criteria.offset))
-            return [delivery_of(row) for row in found]
+            return [from_row(Delivery, row) for row in found]
 
     def delivery(self, delivery_id: str, *, owner: str | None = None) -> Delivery:
         """One delivery with its attempts; with an owner only one to a subscriber of its jobs.
@@ -291,20 +290,14 @@ def _again(now: dt.datetime) -> dict[str, Any]:
 
 
 def _endpoint_row(connection: Connection, endpoint_id: str, *, locked: bool = False) -> sa.Row[Any]:
-    row = None
-    if is_id(endpoint_id):
-        one = sa.select(WEBHOOKS).where(WEBHOOKS.c.endpoint_id == endpoint_id)
-        row = connection.execute(one.with_for_update() if locked else one).one_or_none()
+    row = row_by_id(connection, WEBHOOKS, endpoint_id, locked=locked)
     if row is None:
         raise NoSuchWebhookError(f"there is no webhook {endpoint_id[:64]!r}")
     return row
 
 
 def _delivery_row(connection: Connection, delivery_id: str, owner: str | None, *, locked: bool = False) -> sa.Row[Any]:
-    row = None
-    if is_id(delivery_id):
-        one = sa.select(WEBHOOK_DELIVERIES).where(_TABLE.delivery_id == delivery_id)
-        row = connection.execute(one.with_for_update() if locked else one).one_or_none()
+    row = row_by_id(connection, WEBHOOK_DELIVERIES, delivery_id, locked=locked)
     if row is None or (owner is not None and (row.owner != owner or row.endpoint_id is not None)):
         raise NoSuchDeliveryError(f"there is no delivery {delivery_id[:64]!r} (any more)")
     return row
@@ -312,7 +305,7 @@ def _delivery_row(connection: Connection, delivery_id: str, owner: str | None, *
 
 def _delivery(connection: Connection, delivery_id: str, owner: str | None) -> Delivery:
     """A delivery with its attempts."""
-    found = delivery_of(_delivery_row(connection, delivery_id, owner))
+    found = from_row(Delivery, _delivery_row(connection, delivery_id, owner))
     log = WEBHOOK_ATTEMPTS.c
     chosen = sa.select(log.number, log.at, log.driver, log.duration_ms, log.status, log.error)
     rows = connection.execute(chosen.where(log.delivery_id == delivery_id).order_by(log.number))

@@ -10,6 +10,7 @@ from pydantic import AfterValidator, ConfigDict, Field, ValidationInfo, field_va
 from pipeline.errors import SettingsError
 from pipeline.schedule import Cron
 from service.errors import RequestError, within
+from service.schedules import OUTCOMES
 from service.wire import patterns
 from service.wire.base import Answer, Link, OneOf, Request, Time, ZonedTime, optional_members
 from service.wire.execute import Execute
@@ -152,7 +153,7 @@ class ScheduleRun(Answer):
 
     number: int = Field(ge=1, description="Counts up within the schedule.")
     trigger: Literal["clock", "hand"]
-    outcome: Annotated[str, OneOf("submitted", "waiting", "skipped", "missed", "failed")]
+    outcome: Annotated[str, OneOf(*OUTCOMES)]
     slot: Time | None = Field(None, description="When it was due; the last one if several were missed together.")
     firstSlot: Time | None = Field(None, description="The first one if several were missed together.")
     slots: int = Field(ge=1, description="Number of slots.")

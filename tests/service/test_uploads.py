@@ -31,7 +31,7 @@ from service.files import StateFolder
 from service.jobs import Upload
 from service.keys import Scope
 from service.settings import ServiceSettings
-from service.uploads import TEMPORARY, receive, remove_leftovers
+from service.uploads import STALE_S, TEMPORARY, receive, remove_leftovers
 
 NOW = dt.datetime(2026, 3, 1, tzinfo=dt.UTC)
 
@@ -237,10 +237,10 @@ def test_what_a_dead_process_left_behind_is_cleared_and_what_is_being_written_is
     for path in (old, new):
         path.mkdir()
         (path / "a.laz").write_bytes(b"half")
-    long_ago_s = time.time() - 7200.0
+    long_ago_s = time.time() - 1.1 * STALE_S
     for path in (old / "a.laz", old):
         os.utime(path, (long_ago_s, long_ago_s))
-    assert remove_leftovers(folder, now_s=time.time(), stale_s=3600.0) == [old]
+    assert remove_leftovers(folder, now_s=time.time()) == [old]
     assert sorted(folder.uploads.iterdir()) == sorted([new, folder.upload(kept.upload_id)])
 
 

@@ -33,10 +33,12 @@ from service.errors import (
     TooManySchedulesError,
     UploadInUseError,
 )
-from service.jobs import Job, JobStatus, QueueLimits
+from service.jobs import Job, JobStatus
 from service.keys import Scope, new_key
-from service.schedules import COUNTED, Definition, Schedule, ScheduleRun, Trigger
+from service.schedules import Definition, Schedule, ScheduleRun, Trigger
+from service.settings import QueueLimits
 from service.store import JobFilter, JobStore, ScheduleFilter, schedules
+from service.store.schedules import COLUMN_OF
 from service.store.slot_book import MAX_KEPT, SlotBook
 from service.store.tables import SCHEDULE_RUNS, SCHEDULES, UPLOADS
 
@@ -157,7 +159,7 @@ class ScheduleStoreContract(ScheduleContract, DatabaseContract):
         assert (made.owner, made.version, made.waiting_slot, made.last_run) == ("k", 1, None, None)
         assert made.next_at == asked.cron.next_time(made.created_at)
         assert made.decided_until == made.created_at >= before
-        assert made.counts == dict.fromkeys(COUNTED, 0)
+        assert made.counts == dict.fromkeys(COLUMN_OF, 0)
         assert store.schedules.get(made.schedule_id, owner="k") == made
         assert runs_of(store, made) == []
 

@@ -27,8 +27,9 @@ from service.errors import (
     StoreError,
     UploadInUseError,
 )
-from service.jobs import Fault, InputReference, Job, JobEvent, JobFailure, JobRequest, JobStatus, QueueLimits, Upload
+from service.jobs import Fault, InputReference, Job, JobEvent, JobFailure, JobRequest, JobStatus, Upload
 from service.keys import Scope, digest_of, new_key, rotated
+from service.settings import QueueLimits
 from service.store import JobFilter, JobStore
 from service.store.changes import MAX_KEPT
 from service.store.tables import METADATA
