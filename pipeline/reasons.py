@@ -13,8 +13,13 @@ class Words(NamedTuple):
 
     short: str
     """Why an object is not a building, or has no model of its own kind, in plain words."""
-    meaning: str
-    """The same with its terms and limits."""
+    long: str = ""
+    """The same with its terms and limits, where they say more."""
+
+    @property
+    def meaning(self) -> str:
+        """All that is to say."""
+        return self.long or self.short
 
 
 REASONS: Mapping[Reason, Words] = {
@@ -24,17 +29,14 @@ REASONS: Mapping[Reason, Words] = {
         "quarters; or too few anywhere on an object to show whether it is planar. In `buildings` only if a "
         "footprint or an override says that there is a building",
     ),
-    Reason.NO_PLANE: Words("no roof plane was found in its points", "no plane passed the refinement"),
-    Reason.NO_PARTITION: Words(
-        "the roof planes could not be turned into faces",
-        "the planes could not be turned into roof faces",
-    ),
+    Reason.NO_PLANE: Words("no roof plane was found in its points"),
+    Reason.NO_PARTITION: Words("the roof planes could not be turned into faces"),
     Reason.INVALID_SOLID: Words(
         "the solid is not valid",
         "the solid broke a validity rule; `validity_codes` lists which",
     ),
-    Reason.TOO_COMPLEX: Words("it exceeded the work limit of one building", "the counted work passed its bound"),
-    Reason.NO_FOOTPRINT: Words("no outline could be made from its points", "no outline could be made from the points"),
+    Reason.TOO_COMPLEX: Words("it exceeded the work limit of one building"),
+    Reason.NO_FOOTPRINT: Words("no outline could be made from its points"),
     Reason.HEIGHT_GIVEN: Words(
         "too few points; a block of the height that its footprint states",
         "no model could be made of the points; the block has the height that an attribute of its footprint gives",
@@ -87,33 +89,21 @@ REASONS: Mapping[Reason, Words] = {
         "it took more memory than its process may have (`--building-memory`), or the machine had no more; kept as "
         "a bundle",
     ),
-    Reason.TOO_SMALL: Words("its area is below that of the smallest building", "plan area below the smallest building"),
-    Reason.TOO_LOW: Words("it is lower than the lowest building", "height above ground below the lowest building"),
+    Reason.TOO_SMALL: Words("its area is below that of the smallest building"),
+    Reason.TOO_LOW: Words("it is lower than the lowest building"),
     Reason.BELOW_Z_AVG: Words(
         "it lies below the walls around it: a street or a yard",
         "the surface lies below the Z_avg of the walls around it: a street, a yard",
     ),
-    Reason.NO_WALLS: Words(
-        "too little of its outline is wall: a mound or a bank",
-        "too little of its outline is wall: a mound, a bank",
-    ),
-    Reason.VEGETATION: Words(
-        "vegetation: rough, many returns, ground seen beneath",
-        "rough, many returns, ground seen beneath",
-    ),
-    Reason.TOO_NARROW: Words(
-        "narrower than a building: a wall, a hedge or a wire",
-        "narrower than a building: a wall, a hedge, a wire",
-    ),
+    Reason.NO_WALLS: Words("too little of its outline is wall: a mound or a bank"),
+    Reason.VEGETATION: Words("vegetation: rough, many returns, ground seen beneath"),
+    Reason.TOO_NARROW: Words("narrower than a building: a wall, a hedge or a wire"),
     Reason.BRIDGE: Words(
         "the deck of a bridge",
         "level with the ground along two opposite ends, or one end of a long surface, and free along its sides: "
         "the deck of a bridge",
     ),
-    Reason.VEHICLE: Words(
-        "narrow, low and free all around: a vehicle or a container",
-        "narrow, low and free all around: a van, a truck, a row of them, a container",
-    ),
+    Reason.VEHICLE: Words("narrow, low and free all around: a vehicle or a container"),
     Reason.STRIPS_DISAGREE: Words(
         "flight strips that do not fit each other here: it may be a building",
         "the flight strips that saw it lie above one another by more than `min_strip_offset_m`, so it may be a "

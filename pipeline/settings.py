@@ -122,24 +122,9 @@ class RunSettings:
         method = self.building.method
         if method is None:
             raise AssertionError("filled in at construction")
-        return {
-            "general": self.general,
-            "class-codes": self.class_codes,
-            "footprints": self.footprints,
-            "strips": self.scene.strips,
-            "outliers": self.scene.outliers,
-            "ground": self.scene.ground,
-            "vegetation": self.scene.vegetation,
-            "surfaces": self.scene.surfaces,
-            "candidates": self.scene.candidates,
-            "units": self.scene.units,
-            "roof": self.building.roof,
-            "plan": self.building.plan,
-            "roof-type": self.building.roof_type,
-            "guides": self.building.guides,
-            "support": self.building.support,
-            self.general.method: method,
-        }
+        owned = {**vars(self), **vars(self.scene), **vars(self.building)}
+        found = {name: owned[_field_of(name)] for name in SECTIONS}
+        return {"general": self.general, **found, self.general.method: method}
 
     def as_dict(self) -> dict[str, dict[str, Any]]:
         """All values by section and name."""
@@ -183,22 +168,17 @@ class RunSettings:
                 built[name] = build(kind, name, values, faults, _base(name, general))
         if faults:
             raise SettingsError(faults)
-        scene_names = {field.name for field in dataclasses.fields(SceneSettings)}
-        scene = SceneSettings(**{name: built[name] for name in scene_names if name in built})
-        building = ReconstructSettings(
-            method=built.get(method_name),
-            roof=built.get("roof", RoofSettings()),
-            plan=built.get("plan", ArrangementSettings()),
-            roof_type=built.get("roof-type", RoofTypeSettings()),
-            guides=built.get("guides", GuideSettings()),
-            support=built.get("support", SupportSettings()),
-        )
+
+        def given(kind: Any) -> dict[str, Any]:
+            """The sections of a class that the file has, by the names of their fields."""
+            names = {field.name for field in dataclasses.fields(kind)}
+            return {_field_of(name): built[name] for name in SECTIONS if name in built and _field_of(name) in names}
+
         return cls(
             general=general or GeneralSettings(),
-            class_codes=built.get("class-codes", ClassCodeSettings()),
-            footprints=built.get("footprints", FootprintSettings()),
-            scene=scene,
-            building=building,
+            scene=SceneSettings(**given(SceneSettings)),
+            building=ReconstructSettings(method=built.get(method_name), **given(ReconstructSettings)),
+            **given(cls),
         )
 
     @classmethod
@@ -210,6 +190,11 @@ class RunSettings:
         table = read_table(path)
         table.update(overrides)
         return cls.from_mapping(table)
+
+
+def _field_of(section: str) -> str:
+    """The field of a section, of `RunSettings`, `SceneSettings` or `ReconstructSettings`."""
+    return section.replace("-", "_")
 
 
 def _base(name: str, general: GeneralSettings | None) -> Parameters | None:

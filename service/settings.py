@@ -371,17 +371,10 @@ class ServiceSettings(BaseSettings):
         SettingsError
             Certificates cannot be used.
         """
-        from pipeline.runtime.cluster.tls import given_tls
-        from pipeline.runtime.resources import Resources
+        from pipeline.runtime.resources import resources_of
 
-        return Resources(
-            workers=None if self.workers == "auto" else self.workers,
-            scheduler=self.scheduler,
-            tls=given_tls(self.tls_ca, self.tls_cert, self.tls_key),
-            input_timeout_s=self.input_timeout_s,
-            building_timeout_s=self.building_timeout_s,
-            building_memory_bytes=self.building_memory_bytes,
-        )
+        workers = None if self.workers == "auto" else self.workers
+        return resources_of({**vars(self), "workers": workers}, building_memory_bytes=self.building_memory_bytes)
 
     @property
     def is_loopback(self) -> bool:

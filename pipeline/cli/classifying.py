@@ -57,12 +57,10 @@ def classify(
             **values_of(InputFiles, given),
             **values_of(InputOptions, given),
         )
-        workers, scheduler, footprints = request.resources.workers, request.resources.scheduler, request.footprints
-        compile_for(console.on_event, (*RECONSTRUCT, "classify"), tiles, (footprints,), scheduler=scheduler)
+        scheduler = request.resources.scheduler
+        compile_for(console.on_event, (*RECONSTRUCT, "classify"), tiles, (request.footprints,), scheduler=scheduler)
         if not is_surely_small(tiles):
-            start_early(
-                "classify", workers=workers, scheduler=scheduler, footprints=footprints is not None, method=None
-            )
+            start_early("classify", request.resources, footprints=request.footprints is not None)
         summary = classify_files(request, console.on_event)
         show_classes(console, summary)
         console.document(dataclasses.asdict(summary))

@@ -80,13 +80,7 @@ def compare(
         resources = request.run.resources
         files = values_of(ModelFiles, given).values()
         compile_for(console.on_event, groups, tiles, files, scheduler=resources.scheduler)
-        start_early(
-            "reconstruct",
-            workers=resources.workers,
-            scheduler=resources.scheduler,
-            footprints=request.run.footprints is not None,
-            method=None,
-        )
+        start_early("reconstruct", resources, footprints=request.run.footprints is not None)
         made = compare_files(request, reference, console.on_event)
         facts = comparison_facts(request, made.summary)
         names = tuple(map(str, Status))

@@ -53,13 +53,8 @@ def reconstruct(
         general, scheduler = request.settings.general, request.resources.scheduler
         groups = kernel_groups(method=general.method, points=request.points, terrain=general.terrain)
         compile_for(console.on_event, groups, tiles, values_of(ModelFiles, given).values(), scheduler=scheduler)
-        start_early(
-            "reconstruct",
-            workers=request.resources.workers,
-            scheduler=scheduler,
-            footprints=request.footprints is not None,
-            method=general.method,
-        )
+        has_footprints = request.footprints is not None
+        start_early("reconstruct", request.resources, footprints=has_footprints, method=general.method)
         summary = run(request, console.on_event)
         show_summary(console, summary)
         console.document(dataclasses.asdict(summary))

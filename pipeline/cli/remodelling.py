@@ -41,13 +41,7 @@ def rerun(
         general = earlier.settings.general
         groups = kernel_groups(method=general.method, terrain=general.terrain)
         compile_for(console.on_event, groups, earlier.inputs, (overrides,), scheduler=resources.scheduler)
-        start_early(
-            "reconstruct",
-            workers=resources.workers,
-            scheduler=resources.scheduler,
-            footprints=False,
-            method=general.method,
-        )
+        start_early("reconstruct", resources, method=general.method)
         summary = rerun_buildings(request, console.on_event)
         console.table("Made again", ["building", "status"], list(summary.buildings.items()))
         console.say(f"{len(summary.buildings)} buildings, {len(summary.tiles)} tiles written, {summary.seconds:.1f} s")

@@ -93,9 +93,10 @@ def demo(
         from pipeline.ruler.report.evaluation_page import headline
         from pipeline.runtime.compiling import RECONSTRUCT, compile_first
         from pipeline.runtime.isolation.preloading import start_early
+        from pipeline.runtime.resources import resources_of
 
         compile_first(console.on_event, (*RECONSTRUCT, "simulate", "evaluate"))
-        start_early("reconstruct", workers=given["workers"], scheduler=None, footprints=False, method=None)
+        start_early("reconstruct", resources_of(given))
         made = demonstrate(out, console.on_event, workers=given["workers"], overwrite=overwrite, size_m=size, seed=seed)
         show_summary(console, made.summary)
         decisive = headline(chapters(made.evaluation))

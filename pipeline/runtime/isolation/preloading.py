@@ -8,7 +8,10 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
+
+if TYPE_CHECKING:
+    from pipeline.runtime.resources import Resources
 
 Job = Literal["reconstruct", "classify"]
 
@@ -53,12 +56,12 @@ def has_idle_child() -> bool:
     return pool is not None and bool(pool.has_idle_child())
 
 
-def start_early(job: Job, *, workers: int | None, scheduler: str | None, footprints: bool, method: str | None) -> None:
+def start_early(job: Job, resources: Resources, *, footprints: bool = False, method: str | None = None) -> None:
     """Start the server of a job that may be small, unless it runs elsewhere or a server exists.
 
     It loads the job's stages; if footprints are given no surfaces are searched. The method is None for the default one.
     """
-    if workers is not None or scheduler is not None:
+    if resources.workers is not None or resources.scheduler is not None:
         return
     # loaded before the fork because this process needs it, too: nearly every job reads LAS
     import pipeline.io.las  # noqa: F401

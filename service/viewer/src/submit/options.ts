@@ -8,12 +8,10 @@ import { Boxes, choice, field } from "../page/form_fields";
 import { TABLES } from "../words/tables";
 
 const LABELS = TABLES.inputs;
-const VERTICAL_UNITS = { "": "as in the file", m: "metres", ft: "feet", "us-ft": "US survey feet" };
 
 /** Inputs with a field of their own, or without one; all others get a field by their type. */
 const KNOWN = new Set([
-  "tiles", "footprints", "footprintsLayer", "guides", "crs", "verticalUnit", "allowOutsideAreaOfUse", "method", "preset", "lods", "classes",
-  "points", "publish", "settings", "title",
+  "tiles", "footprints", "footprintsLayer", "guides", "crs", "allowOutsideAreaOfUse", "method", "preset", "lods", "publish", "settings", "title",
 ]);
 
 /** What the options make of a job. */
@@ -29,18 +27,16 @@ export class Options {
   private readonly layerField = field(LABELS.footprintsLayer, this.layer, "Only where the file has several.");
   private readonly crs = el("input", { id: "crs", type: "text", placeholder: "EPSG:28992", autocomplete: "off", spellcheck: "false" });
   private readonly anywhere = checkbox("anywhere", LABELS.allowOutsideAreaOfUse, "Only if the CRS is right: they are far from where it is used.");
-  private readonly verticalUnit = choice("vertical-unit", VERTICAL_UNITS);
   private readonly method = choice("method", {});
   private readonly preset = choice("preset", {});
   private usualPreset = "";
   private readonly others = new Boxes();
   private readonly levels = new Boxes();
   private readonly levelsHint = el("p", { class: "hint", id: "lods-hint" });
-  private readonly classes = choice("classes", {});
-  private readonly points = checkbox("with-points", LABELS.points, "To see them over the models, with their distances to the roofs. Takes longer.");
   private readonly formats = new Boxes();
   /** The fields of all other inputs, and the value of each that is set. */
   private readonly further = el("div");
+  private readonly rows = new Map<string, HTMLElement>();
   private readonly values = new Map<string, () => string | boolean>();
   private ofComparison = new Set<string>();
   private readonly title = el("input", { id: "title", type: "text", autocomplete: "off", maxlength: 200 });
@@ -54,17 +50,14 @@ export class Options {
       el("summary", {}, "Options"),
       field(LABELS.crs, this.crs, "If the file has none or a wrong one."),
       this.anywhere.element,
-      field(LABELS.verticalUnit, this.verticalUnit),
       field(LABELS.method, this.method),
       field(LABELS.preset, this.preset, "Settings that measured better, or those of the method's paper."),
       group("Levels of detail", this.levels, this.levelsHint),
       group("Compare with", this.others),
-      field(LABELS.classes, this.classes, "Trusted, only compared with the result, or ignored."),
       ...footprints,
       this.layerField,
       this.layers,
       ...guides,
-      this.points.element,
       group(LABELS.publish, this.formats),
       this.further,
       field(LABELS.title, this.title),
@@ -78,7 +71,7 @@ export class Options {
   /** Fill the choices from the processes' own descriptions. */
   async describe(): Promise<void> {
     const { inputs } = await getJson<{ inputs: Record<string, InputDescription> }>("processes/reconstruct");
-    for (const [select, name] of [[this.method, "method"], [this.preset, "preset"], [this.classes, "classes"]] as const) {
+    for (const [select, name] of [[this.method, "method"], [this.preset, "preset"]] as const) {
       const schema = inputs[name]?.schema;
       select.replaceChildren(...(schema?.enum ?? []).map((value) => el("option", { value, selected: value === schema?.default }, value)));
     }
@@ -117,14 +110,11 @@ export class Options {
     const chosen: [string, string][] = [
       ["crs", this.crs.value.trim()],
       ["footprintsLayer", this.layerField.hidden ? "" : this.layer.value.trim()],
-      ["verticalUnit", this.verticalUnit.value],
-      ["classes", this.classes.value],
     ];
     if (variants.length > 1) {
       inputs["methods"] = variants;
     } else {
       chosen.push(["method", this.method.value], ["preset", this.preset.value], ["lods", lodsInput(this.levels.chosen)]);
-      if (this.points.box.checked) inputs["points"] = true;
       if (this.formats.chosen.length > 0) inputs["publish"] = this.formats.chosen;
     }
     for (const [name, value] of chosen) if (value !== "") inputs[name] = value;
@@ -150,7 +140,7 @@ export class Options {
     this.layers.replaceChildren(...(layers ?? []).map((value) => el("option", { value })));
     this.levels.disable(() => isComparison);
     this.formats.disable(() => isComparison);
-    this.points.box.disabled = isComparison;
+    for (const [name, element] of this.rows) element.hidden = isComparison && !this.ofComparison.has(name);
     this.levelsHint.textContent = isComparison ? "Comparisons are made at LoD2.2." : "One or several; the records describe the finest.";
     this.others.disable((value) => value === this.chosen);
   }
@@ -164,18 +154,21 @@ export class Options {
   /** A field for an input that needs none of its own: a permission, a word of several, or a text. */
   private addField(name: string, { title = name, description = "", schema }: InputDescription): void {
     const id = `option-${name}`;
+    const add = (element: HTMLElement, valueOf: () => string | boolean): void => {
+      this.further.append(element);
+      this.rows.set(name, element);
+      this.values.set(name, valueOf);
+    };
     if (schema.type === "boolean") {
       const { box, element } = checkbox(id, title, description);
-      this.further.append(element);
-      this.values.set(name, () => box.checked);
+      add(element, () => box.checked);
     } else if (schema.enum !== undefined) {
-      const words = choice(id, labelled(schema.enum, (word) => word), String(schema.default));
-      this.further.append(field(title, words, description));
-      this.values.set(name, () => (words.value === schema.default ? "" : words.value));
+      const usual: Record<string, string> = schema.default === undefined ? { "": "as in the file" } : {};
+      const words = choice(id, { ...usual, ...labelled(schema.enum, (word) => word) }, String(schema.default ?? ""));
+      add(field(title, words, description), () => (words.value === schema.default ? "" : words.value));
     } else if (schema.type === "string") {
       const text = el("input", { id, type: "text", autocomplete: "off" });
-      this.further.append(field(title, text, description));
-      this.values.set(name, () => text.value.trim());
+      add(field(title, text, description), () => text.value.trim());
     }
   }
 
