@@ -6,7 +6,9 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -16,30 +18,30 @@ import typer
 from pipeline.batch.batch_file import TABLES
 from pipeline.cli import command_line as built
 from pipeline.console import EXIT_CODES
-from pipeline.export import cityjson
 from pipeline.export.columns import COLUMNS, KINDS, TILE_COLUMN, Column
 from pipeline.extras.party_walls import party_wall_tables
 from pipeline.extras.publish_gis import geopackage, pmtiles
 from pipeline.extras.solar import solar_table
 from pipeline.methods import METHODS
+from pipeline.model import Reason
 from pipeline.parameters import Parameters
 from pipeline.quality import validity as checker
+from pipeline.reasons import REASONS
 from pipeline.ruler.epochs import records as changes_of
 from pipeline.ruler.epochs.settings import DiffSettings
 from pipeline.ruler.evaluation.chapters import TITLES
 from pipeline.ruler.evaluation.definitions import DEFINITIONS
 from pipeline.settings import SECTIONS, GeneralSettings
+from pipeline.terrain.candidates import REASON_OF_FAULT
 from service.cli import COMMANDS
 
+USUAL = ("400", "401", "403", "404", "422", "429", "500", "503")
+"""Answers that most paths give, and that the table of paths leaves out."""
 REFERENCE = Path(__file__).resolve().parent / "reference"
 NOTE = "<!-- Written by `make docs` from the code; do not edit. -->"
 
 TITLES_OF_TABLES = {layer.name: f"{layer.description}." for layer in geopackage.LAYERS}
-FORMATS = {
-    "GeoPackage": geopackage.STORED_TYPES,
-    "CityJSON": cityjson.ATTRIBUTE_TYPES,
-    "PMTiles": pmtiles.PROPERTY_TYPES,
-}
+FORMATS = {"GeoPackage": "geopackage", "CityJSON": "cityjson", "PMTiles": "pmtiles"}
 NOTES_OF_FORMATS = [
     "- GeoPackage has no `bbox`, which the spatial index replaces, and no columns of solids, since a layer has one",
     "  geometry. `geometry` is a MultiPolygon in each layer, a single Polygon too; a MultiPolygon Z in `planes`.",
@@ -54,6 +56,11 @@ NOTES_OF_FORMATS = [
     "  `int` and `double` are equal numbers; a double may be stored as an integer or a float that equals it. A null is",
     "  a property that is not there. JavaScript reads integers beyond 2^53 inexactly.",
 ]
+
+
+def types_in(kind: str) -> list[str]:
+    """What a type of the tables becomes in each of `FORMATS`."""
+    return [getattr(KINDS[kind], name) for name in FORMATS.values()]
 
 
 def cell(text: object) -> str:
@@ -106,18 +113,36 @@ def commands(group: Any | None = None, prefix: str = "") -> dict[str, Any]:
     return dict(sorted(found.items()))
 
 
+def first_name(row: tuple[str, str, str]) -> str:
+    """The first name of an option, from its row."""
+    return row[0].split()[0].rstrip(",")
+
+
 def command_line() -> str:
     """The page of the command line."""
-    lines = [NOTE, "# The command line", ""]
-    lines += ["`gablework COMMAND --help` prints the same. How commands end: [exit codes](exit_codes.md).", ""]
-    for name, command in commands().items():
-        rows: list[list[object]] = [
-            [option_names(parameter), default_of(parameter), getattr(parameter, "help", "") or ""]
+    header = ["option", "default", "meaning"]
+    rows = {
+        name: [
+            (option_names(parameter), default_of(parameter), getattr(parameter, "help", "") or "")
             for parameter in command.params
             if parameter.name != "help"
         ]
+        for name, command in commands().items()
+    }
+    counts = Counter(row for found in rows.values() for row in found if row[0].startswith("`--"))
+    # of the meanings of one option, only the most frequent is shared
+    often = {first_name(row): row for row, count in sorted(counts.items(), key=lambda item: item[1]) if count > 1}
+    shared = sorted(often.values())
+    lines = [NOTE, "# The command line", ""]
+    lines += ["`gablework COMMAND --help` prints the same. How commands end: [exit codes](exit_codes.md).", ""]
+    for name, command in commands().items():
         lines += [f"## gablework {name}", "", (command.help or "").strip(), ""]
-        lines += [*table(["option", "default", "meaning"], rows), ""]
+        own = [row for row in rows[name] if row not in shared]
+        others = [first_name(row) for row in rows[name] if row in shared]
+        lines += [*table(header, [list(row) for row in own]), ""] if own else []
+        lines += [f"[Shared options](#shared-options): {', '.join(others)}.", ""] if others else []
+    lines += ["## Shared options", "", "Options that mean the same in several commands.", ""]
+    lines += [*table(header, [list(row) for row in shared]), ""]
     return "\n".join(lines)
 
 
@@ -137,6 +162,12 @@ def allowed(field: dataclasses.Field[Any]) -> str:
     return f"up to {high:g}" if low is None else f"{low:g} to {high:g}"
 
 
+def allowed_with_unit(field: dataclasses.Field[Any]) -> str:
+    """The values that a setting accepts, with their unit."""
+    values, unit = allowed(field), field.metadata["unit"]
+    return f"{values} {unit}".rstrip() if values != "any" else ", ".join(filter(None, (values, unit)))
+
+
 def toml(value: object) -> str:
     """A default as TOML writes it."""
     if isinstance(value, tuple):
@@ -154,10 +185,8 @@ def sections() -> dict[str, list[list[object]]]:
             [
                 f"`{field.name}`",
                 toml(field.default),
-                field.metadata["unit"],
-                allowed(field),
-                "yes" if field.metadata["changes_geometry"] else "no",
-                field.metadata["doc"],
+                allowed_with_unit(field),
+                field.metadata["doc"] + ("" if field.metadata["changes_geometry"] else " (not hashed)"),
             ]
             for field in dataclasses.fields(kind)
         ]
@@ -182,10 +211,10 @@ def settings() -> str:
         "min_area_m2 = 15.0",
         "```",
         "",
-        "Values that cannot change results (*no* under *geometry*) are not part of the `settings_hash`.",
+        "*Not hashed* marks values that cannot change geometry; they are not part of the `settings_hash`.",
         "",
     ]
-    header = ["setting", "default", "unit", "allowed", "geometry", "meaning"]
+    header = ["setting", "default", "allowed", "meaning"]
     for name, rows in sections().items():
         lines += [f"## [{name}]", "", *table(header, rows), ""]
     return "\n".join(lines)
@@ -225,7 +254,7 @@ def paths() -> list[list[object]]:
     for path, item in create_app(ServiceSettings()).openapi()["paths"].items():
         for method, operation in item.items():
             needs_key = "yes" if "security" in operation else "no"
-            answers = ", ".join(operation["responses"])
+            answers = ", ".join(status for status in operation["responses"] if status not in USUAL)
             rows.append([f"`{method.upper()} {path}`", operation["summary"], needs_key, answers])
     return rows
 
@@ -243,8 +272,20 @@ def service_settings() -> list[list[object]]:
     return rows
 
 
+def outputs() -> list[list[object]]:
+    """Rows of the table of outputs."""
+    from service.outputs.kinds import CLASSIFICATION_OUTPUTS, COMPARISON_OUTPUTS, OUTPUTS
+
+    kinds = {"reconstruct": OUTPUTS, "compare": COMPARISON_OUTPUTS, "classify": CLASSIFICATION_OUTPUTS}
+    return [
+        [process, f"`{kind.output_id}`", f"`{kind.media_type}`", f"`{kind.filename}`", kind.title]
+        for process, found in kinds.items()
+        for kind in found.values()
+    ]
+
+
 def service() -> str:
-    """The page of the service: paths, problems, keys, settings."""
+    """The page of the service: paths, outputs, problems, keys, settings."""
     from service.keys import Scope
     from service.problems import FAILURES, FOREIGN, INTERNAL, KINDS
     from service.routes.landing import CLASSES
@@ -264,9 +305,17 @@ def service() -> str:
         "",
         "## Paths",
         "",
-        "*Key* says whether a key is needed if the service has keys.",
+        "*Key* says whether a key is needed if the service has keys. *Answers* leaves out those that most paths give:",
+        f"{', '.join(USUAL)}.",
         "",
         *table(["path", "what it does", "key", "answers"], paths()),
+        "",
+        "## Outputs",
+        "",
+        "The results of a job, by process: [how to get them](../how_to/results_by_rest.md). `/processes/{processID}`",
+        "describes each one.",
+        "",
+        *table(["process", "output", "media type", "file", "content"], outputs()),
         "",
         "## Conformance",
         "",
@@ -303,6 +352,36 @@ def service() -> str:
     return "\n".join(lines) + "\n"
 
 
+def reasons() -> str:
+    """The page of reasons: those of buildings, then those of rejected objects."""
+    rejected = {*REASON_OF_FAULT.values(), Reason.STRIPS_DISAGREE, Reason.OVERRIDDEN}
+    modelled = {Reason.TOO_FEW_POINTS, *Reason} - (rejected - {Reason.TOO_FEW_POINTS})
+
+    def rows(chosen: set[Reason]) -> list[list[object]]:
+        return [[f"`{reason.value}`", words.meaning] for reason, words in REASONS.items() if reason in chosen]
+
+    lines = [
+        NOTE,
+        "# Reasons",
+        "",
+        "The list is closed; `reason_detail` has the figure and the threshold. [Records](records.md#status) has the",
+        "statuses, [poisonous buildings](../how_to/poisonous_buildings.md) shows how to replay a bundle.",
+        "",
+        "## Buildings",
+        "",
+        "Why a candidate is `doubtful`, `fallback` or `failed`.",
+        "",
+        *table(["reason", "meaning"], rows(modelled)),
+        "",
+        "## Rejected objects",
+        "",
+        "Why an object is not a building.",
+        "",
+        *table(["reason", "meaning"], rows(rejected)),
+    ]
+    return "\n".join(lines) + "\n"
+
+
 def measures() -> str:
     """The page of measures, from their definitions."""
     lines = [
@@ -326,11 +405,11 @@ def measures() -> str:
     ]
     for group, title in TITLES.items():
         rows: list[list[object]] = [
-            [f"`{one.name}`", one.label, one.unit, str(one.better), one.formula]
+            [f"`{one.name}`", one.label, ", ".join(filter(None, (one.unit, str(one.better)))), one.formula]
             for one in DEFINITIONS.values()
             if one.group is group
         ]
-        lines += [f"## {title}", "", *table(["measure", "what", "unit", "better", "formula"], rows), ""]
+        lines += [f"## {title}", "", *table(["measure", "what", "unit, better", "formula"], rows), ""]
     return "\n".join(lines)
 
 
@@ -346,30 +425,24 @@ def batch_file() -> str:
     ]
     own: dict[str, list[list[object]]] = {
         "inputs": [
-            ["`paths`", "required", "", "a list", "Files, folders or patterns of point clouds."],
-            [
-                "`bbox`",
-                "none",
-                "",
-                "four numbers",
-                "Only this rectangle: x_min, y_min, x_max, y_max in the CRS's units.",
-            ],
+            ["`paths`", "required", "a list", "Files, folders or patterns of point clouds."],
+            ["`bbox`", "none", "four numbers", "Only this rectangle: x_min, y_min, x_max, y_max in the CRS's units."],
         ]
     }
     for name, kind in TABLES.items():
         rows = own.get(name, []) + [
-            [f"`{field.name}`", toml(field.default), field.metadata["unit"], allowed(field), field.metadata["doc"]]
+            [f"`{field.name}`", toml(field.default), allowed_with_unit(field), field.metadata["doc"]]
             for field in dataclasses.fields(kind)
         ]
         about = (kind.__doc__ or "").strip().split(": ", 1)[-1]
         lines += ["", f"## `[{name}]`", "", f"{about[:1].upper()}{about[1:]}", ""]
-        lines += table(["key", "default", "unit", "allowed", "meaning"], rows)
+        lines += table(["key", "default", "allowed", "meaning"], rows)
     return "\n".join(lines) + "\n"
 
 
 def setting_row(field: dataclasses.Field[Any]) -> list[object]:
     """A threshold of `gablework batch diff`."""
-    return [f"`{field.name}`", toml(field.default), field.metadata["unit"], allowed(field), field.metadata["doc"]]
+    return [f"`{field.name}`", toml(field.default), allowed_with_unit(field), field.metadata["doc"]]
 
 
 def changes() -> str:
@@ -426,7 +499,7 @@ def changes() -> str:
         "The table `[diff]` of a `--settings` file; it holds only values that differ.",
         "",
         *table(
-            ["setting", "default", "unit", "allowed", "meaning"],
+            ["setting", "default", "allowed", "meaning"],
             [setting_row(field) for field in dataclasses.fields(DiffSettings)],
         ),
     ]
@@ -475,7 +548,10 @@ def columns() -> str:
         "",
         "GeoParquet holds the types as they are. The other formats lack some of them.",
         "",
-        *table(["type", *FORMATS], [[f"`{kind}`", *(types[kind] for types in FORMATS.values())] for kind in KINDS]),
+        *table(
+            ["type", *FORMATS],
+            [[f"`{kind}`", *(getattr(types, name) for name in FORMATS.values())] for kind, types in KINDS.items()],
+        ),
         "",
         *NOTES_OF_FORMATS,
     ]
@@ -523,6 +599,17 @@ def party_walls() -> str:
     return "\n".join(lines) + "\n"
 
 
+VIEWER_WORDS = REFERENCE.parents[1] / "service" / "viewer" / "tests" / "words.json"
+"""The words of the web page, for its own tests: the service puts them into the page."""
+
+
+def viewer_words() -> str:
+    """The words as JSON."""
+    from service.page_words import page_words
+
+    return json.dumps(page_words(), indent=1, ensure_ascii=False) + "\n"
+
+
 PAGES: Mapping[str, Callable[[], str]] = {
     "settings.md": settings,
     "batch_file.md": batch_file,
@@ -533,6 +620,7 @@ PAGES: Mapping[str, Callable[[], str]] = {
     "measures.md": measures,
     "changes.md": changes,
     "columns.md": columns,
+    "reasons.md": reasons,
     "solar.md": solar,
     "party_walls.md": party_walls,
 }
@@ -544,6 +632,8 @@ def main() -> None:
     for name, render in PAGES.items():
         (REFERENCE / name).write_text(render(), encoding="utf-8")
         print(f"wrote docs/reference/{name}")
+    VIEWER_WORDS.write_text(viewer_words(), encoding="utf-8")
+    print(f"wrote {VIEWER_WORDS.relative_to(REFERENCE.parents[1])}")
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import datetime as dt
 import math
 
 
@@ -89,3 +90,27 @@ class Pauses:
     def begin_anew(self) -> None:
         """Count failures from 0 again: it succeeded."""
         self._failures = 0
+
+
+def wanted_pause_s(retry_after: str | None, now: dt.datetime | None = None) -> float:
+    """The pause in seconds that a header Retry-After wants; 0 without one, or if it cannot be read.
+
+    A date is read only with the present.
+
+    >>> wanted_pause_s("120"), wanted_pause_s(None), wanted_pause_s("Sun, 01 Mar 2026 00:00:30 GMT")
+    (120.0, 0.0, 0.0)
+    >>> wanted_pause_s("Sun, 01 Mar 2026 00:00:30 GMT", dt.datetime(2026, 3, 1, tzinfo=dt.UTC))
+    30.0
+    """
+    text = (retry_after or "").strip()
+    if text.isascii() and text.isdigit():
+        return float(text)
+    if now is None:
+        return 0.0
+    from email.utils import parsedate_to_datetime
+
+    try:
+        at = parsedate_to_datetime(text)
+    except ValueError:
+        return 0.0
+    return max(0.0, ((at if at.tzinfo is not None else at.replace(tzinfo=dt.UTC)) - now).total_seconds())

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
 from enum import StrEnum
 from typing import Any
 
@@ -65,49 +64,6 @@ class Reason(StrEnum):
     VEHICLE = "vehicle"
     STRIPS_DISAGREE = "strips_disagree"
     OVERRIDDEN = "overridden"
-
-
-REASONS: Mapping[Reason, str] = {
-    Reason.TOO_FEW_POINTS: "fewer points than a plane needs; or fewer than `min_points`, of which the model "
-    "explains less than three quarters; or too few anywhere on an object to show whether it is planar. In "
-    "`buildings` only if a footprint or an override says that there is a building",
-    Reason.NO_PLANE: "no plane passed the refinement",
-    Reason.NO_PARTITION: "the planes could not be turned into roof faces",
-    Reason.INVALID_SOLID: "the solid broke a validity rule; `validity_codes` lists which",
-    Reason.TOO_COMPLEX: "the counted work passed its bound",
-    Reason.NO_FOOTPRINT: "no outline could be made from the points",
-    Reason.HEIGHT_GIVEN: "no model could be made of the points; the block has the height that an attribute of its "
-    "footprint gives",
-    Reason.POOR_FIT: "`doubtful`: too few of its roof returns lie on the model",
-    Reason.SCATTERED: "`doubtful`: its roof returns scatter about the model more than a roof does: a tree, a heap",
-    Reason.NOT_SEEN: "`doubtful`: too much of the roof is drawn where no point is, or may lie where none is",
-    Reason.TOO_MANY_FACES: "`doubtful`: too few roof returns for so many roof faces",
-    Reason.UNCERTAIN: "`doubtful`: it may not be a building; the detail is the confidence, or how much of a level roof "
-    "the ground reaches",
-    Reason.ABOVE_POINTS: "`doubtful`: a roof face rises above all its points by more than their noise and its rise "
-    "over two point spacings",
-    Reason.LEVEL_THROUGH_SLOPE: "`doubtful`: most points within a level roof face lie on a slope that is not modelled",
-    Reason.INTERNAL_ERROR: "a fault of gablework in this one building; the detail names the exception; kept as a "
-    "bundle",
-    Reason.CRASHED: "its process died at it, twice, the second time alone; the detail names the signal or the exit "
-    "code; kept as a bundle",
-    Reason.TIMED_OUT: "it took longer than the limit that protects the run (`--building-timeout`); kept as a bundle",
-    Reason.OUT_OF_MEMORY: "it took more memory than its process may have (`--building-memory`), or the machine had no "
-    "more; kept as a bundle",
-    Reason.TOO_SMALL: "plan area below the smallest building",
-    Reason.TOO_LOW: "height above ground below the lowest building",
-    Reason.BELOW_Z_AVG: "the surface lies below the Z_avg of the walls around it: a street, a yard",
-    Reason.NO_WALLS: "too little of its outline is wall: a mound, a bank",
-    Reason.VEGETATION: "rough, many returns, ground seen beneath",
-    Reason.TOO_NARROW: "narrower than a building: a wall, a hedge, a wire",
-    Reason.BRIDGE: "level with the ground along two opposite ends, or one end of a long surface, and free along its "
-    "sides: the deck of a bridge",
-    Reason.VEHICLE: "narrow, low and free all around: a van, a truck, a row of them, a container",
-    Reason.STRIPS_DISAGREE: "the flight strips that saw it lie above one another by more than "
-    "`min_strip_offset_m`, so it may be a building; the detail names the offset, and what it looks like",
-    Reason.OVERRIDDEN: "the user's overrides reject it; the detail is their note",
-}
-"""Meanings of the reasons, as in the records' reference."""
 
 
 class RoofType(StrEnum):

@@ -79,7 +79,7 @@ class ChosenSettings(Parameters):
         label="Method",
     )
     preset: str = option(
-        "Defaults of the method's settings: those that measured better, or those of its paper.",
+        "Defaults of the method's settings: the ones that measured better, or the paper's.",
         "robust",
         choices=PRESETS,
         changes_geometry=False,

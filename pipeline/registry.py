@@ -26,8 +26,8 @@ def extra(name: str) -> Any:
 
     Examples
     --------
-    >>> extra("PlyFile").__name__
-    'PlyFile'
+    >>> extra("ObjectStorage").__name__
+    'ObjectStorage'
     """
     return loaded(f"pipeline.extras.{EXTRAS[name]}")
 
@@ -66,9 +66,6 @@ EXTRAS: Mapping[str, str] = {
     # papers
     "primitive_partition": "papers.primitives:primitive_partition",
     "unite_flush_walls": "papers.flush_walls:unite_flush_walls",
-    # ply_ascii
-    "AsciiFile": "ply_ascii.ascii:AsciiFile",
-    "PlyFile": "ply_ascii.ply:PlyFile",
     # remote
     "ObjectHandler": "remote.arrow_objects:ObjectHandler",
     "ObjectStorage": "remote.object_storage:ObjectStorage",
@@ -84,5 +81,6 @@ EXTRAS: Mapping[str, str] = {
 }
 """Where the extras add to a run: what the core asks for by name, and its "folder.module:name".
 
-Methods (`METHODS`), ground filters (`FILTERS`) and commands (`COMMANDS`) have tables of their own.
+Methods (`METHODS`), ground filters (`FILTERS`), formats of points (`FORMATS`) and commands (`COMMANDS`) have tables of
+their own.
 """

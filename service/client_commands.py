@@ -15,6 +15,7 @@ import typer
 from pipeline.cli.options import AsJson, Quiet, SettingsFile, set_parameters, takes_options
 from pipeline.console import Console, ExitCode, exit_code_of
 from pipeline.errors import SettingsError
+from pipeline.extras.publish.publishing import FORMS
 from pipeline.options import served
 
 if TYPE_CHECKING:
@@ -162,7 +163,7 @@ def submit(
         typer.Option(
             "--publish",
             metavar="FORMAT",
-            help="Also 3dtiles, geopackage, pmtiles, cityjson, stac, solar or party-walls; repeat for several.",
+            help=f"Also {', '.join(list(FORMS)[:-1])} or {list(FORMS)[-1]}; repeat for several.",
         ),
     ] = None,
     geoid_height: Annotated[
@@ -181,7 +182,7 @@ def submit(
         int | None, typer.Option(metavar="N", min=-10, max=10, help="Higher runs first; above 0 needs an admin key.")
     ] = None,
     subscriber: Annotated[
-        str | None, typer.Option(metavar="JSON", help="Where to send news of the job: successUri, failedUri, …")
+        str | None, typer.Option(metavar="JSON", help="URLs for news of the job: successUri, failedUri, …")
     ] = None,
     new: Annotated[
         bool, typer.Option("--new", help="Make another job, even if the same command has made one within a day.")
@@ -222,7 +223,7 @@ def submit(
 
 @_of_service
 def watch(remote: Remote, job: JobId) -> None:
-    """Follow a job to its end; the exit code is that of its outcome."""
+    """Follow a job to its end; the exit code shows its outcome."""
     _watched(remote, job)
 
 
@@ -281,7 +282,7 @@ def request(
     path: Annotated[str, typer.Argument(metavar="PATH", help="Path below the service's URL, such as /schedules.")],
     data: Annotated[
         str | None,
-        typer.Option(metavar="JSON", help="The body: JSON, @FILE for that of a file, or - for standard input."),
+        typer.Option(metavar="JSON", help="The body: JSON, @FILE for the JSON of a file, or - for standard input."),
     ] = None,
 ) -> None:
     """Send any other request with the key, and print the answer: schedules, webhooks, single buildings."""

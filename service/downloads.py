@@ -19,7 +19,7 @@ from urllib.parse import unquote
 
 import httpx
 
-from pipeline.backoff import Backoff
+from pipeline.backoff import Backoff, wanted_pause_s
 from pipeline.errors import RunCancelledError, UnreadableInputError
 from service.disk import FULL, MAKE_ROOM, Disk
 from service.errors import NoSpaceError, TooLargeError
@@ -74,8 +74,7 @@ def pause_s(attempt: int, *, status: int | None, retry_after: str | None = None)
     """
     if status is not None and status not in PASSING:
         return None
-    wanted = float(retry_after) if retry_after is not None and retry_after.isascii() and retry_after.isdigit() else 0.0
-    return BACKOFF.pause_s(attempt, wanted_s=min(wanted, BACKOFF.longest_s))
+    return BACKOFF.pause_s(attempt, wanted_s=min(wanted_pause_s(retry_after), BACKOFF.longest_s))
 
 
 class _PassingError(Exception):

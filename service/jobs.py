@@ -19,11 +19,25 @@ from __future__ import annotations
 
 import dataclasses
 import datetime as dt
+import sys
 from collections.abc import Mapping
 from enum import StrEnum
 from typing import Any, Literal
 
 from pipeline.options import ModelOptions
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class QueueLimits:
+    """How many jobs may wait; running ones do not count."""
+
+    max_queued: int = sys.maxsize
+    """All jobs."""
+    max_queued_per_key: int = sys.maxsize
+    """Jobs of one key."""
+
+
+UNLIMITED = QueueLimits()
 
 
 class JobStatus(StrEnum):

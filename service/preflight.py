@@ -25,8 +25,9 @@ from typing import IO, Any
 from pipeline.errors import CrsError, EmptyInputError, InputError, UnreadableInputError
 from pipeline.io.area_of_use import Location
 from pipeline.io.crs import LARGEST_COORDINATE
-from pipeline.io.formats import VECTOR_SUFFIXES, recognise_format
+from pipeline.io.formats import FORMATS, VECTOR_SUFFIXES, PointFormat, recognise_format
 from pipeline.io.temporary import temporary_folder
+from pipeline.registry import loaded
 from service.errors import TooLargeError
 from service.vectors import examine_vector
 from service.wording import as_inputs
@@ -78,16 +79,16 @@ def examine(path: Path, *, max_points: int) -> dict[str, Any]:
 
 def _examine_points(path: Path, max_points: int) -> dict[str, Any]:
     """Format, count, CRS, bounds of a point cloud."""
-    name = recognise_format(path)
-    _check_count(path, _count_before_reading(path, name), max_points)
-    if name != "las" and path.stat().st_size > PASS_BYTES:
-        return _only_counted(path, name)
-    from pipeline.io.source import READERS, ReadOptions, open_source
+    form = recognise_format(path)
+    _check_count(path, _count_before_reading(path, form), max_points)
+    if not form.has_bounds and path.stat().st_size > PASS_BYTES:
+        return _only_counted(path, form)
+    from pipeline.io.source import ReadOptions, open_source, opened_as
 
     try:
         known = open_source(path).info
     except CrsError as fault:
-        facts = READERS[name](path, ReadOptions()).facts
+        facts = opened_as(form, path, ReadOptions()).facts
         _check_facts(path, facts.point_count, facts.bounds, max_points)
         crs = None if facts.crs is None else {"name": facts.crs.name, "epsg": facts.crs.to_epsg()}
         return _points(
@@ -158,10 +159,10 @@ def _points(kind: str, count: int, **known: Any) -> dict[str, Any]:
     return facts | {"usable": not facts["problems"]}
 
 
-def _only_counted(path: Path, name: str) -> dict[str, Any]:
-    """The facts of text and PLY that are too large to be read through here."""
+def _only_counted(path: Path, form: PointFormat) -> dict[str, Any]:
+    """The facts of files without bounds that are too large to be read through here."""
     warning = f"the file has no header with bounds and more than {PASS_BYTES >> 20} MiB: the job reads it through"
-    return _points(name, _count_before_reading(path, name), warnings=[warning])
+    return _points(form.name, _count_before_reading(path, form), warnings=[warning])
 
 
 def _check_count(path: Path, count: int, max_points: int) -> None:
@@ -174,27 +175,22 @@ def _check_count(path: Path, count: int, max_points: int) -> None:
 
 
 def promised_points(path: Path) -> int | None:
-    """The number of points in the header of a LAS, LAZ or PLY file; None for text, which has no header.
+    """The number of points in the header of a file; None for text, which has none.
 
     Raises
     ------
     InputError
         Not a supported format, or the header is damaged.
     """
-    name = recognise_format(path)
-    return None if name == "ascii" else _count_before_reading(path, name)
+    form = recognise_format(path)
+    return _count_before_reading(path, form) if form.count else None
 
 
-def _count_before_reading(path: Path, name: str) -> int:
+def _count_before_reading(path: Path, form: PointFormat) -> int:
     """Points by the header, or for text the largest possible number, without parsing any."""
-    if name == "las":
-        from pipeline.io.las_header import read_header_block
-
-        return read_header_block(path).point_count
-    if name == "ply":
-        from pipeline.extras.ply_ascii.ply import promised_vertices
-
-        return promised_vertices(path)
+    if form.count:
+        count: int = loaded(form.count)(path)
+        return count
     lines = 1
     with path.open("rb") as stream:
         while block := stream.read(BLOCK_BYTES):
@@ -314,8 +310,9 @@ def end_examiners() -> None:
 
 
 def is_quick(path: Path) -> bool:
-    """Whether a file is examined in a moment: it is small, or a LAS or LAZ file, of which only the header is read."""
-    return path.suffix.lower() in {".las", ".laz"} or path.stat().st_size <= QUICK_BYTES
+    """Whether a file is examined in a moment: it is small, or only its header is read."""
+    has_bounds = any(path.suffix.lower() in form.suffixes for form in FORMATS if form.has_bounds)
+    return has_bounds or path.stat().st_size <= QUICK_BYTES
 
 
 def preflight(path: Path, max_points: int) -> Mapping[str, Any]:

@@ -14,6 +14,7 @@ from pydantic import Field, ValidationInfo, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from service.errors import StartUpError
+from service.jobs import QueueLimits
 
 if TYPE_CHECKING:
     from pipeline.runtime.resources import Resources
@@ -329,6 +330,11 @@ class ServiceSettings(BaseSettings):
         if info.data.get("map_tiles") is not None and not value.strip():
             raise ValueError("map_tiles is set: name the owners of these tiles")
         return value
+
+    @property
+    def queue_limits(self) -> QueueLimits:
+        """How many jobs may wait."""
+        return QueueLimits(max_queued=self.max_queued, max_queued_per_key=self.max_queued_per_key)
 
     @property
     def map_origin(self) -> str | None:

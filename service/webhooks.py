@@ -30,8 +30,10 @@ from collections.abc import Mapping
 from enum import StrEnum
 from typing import Any, Self
 
+from pydantic import TypeAdapter
+
 from pipeline.backoff import Backoff
-from service.jobs import Fault, Job, JobFailure, JobRequest, JobStatus
+from service.jobs import Job, JobStatus
 
 SECRET_PREFIX = "whsec_"  # noqa: S105 - the prefix that the standard gives to secrets
 _SECRET_BYTES = 32
@@ -287,24 +289,18 @@ def verdict(delivery: Delivery, result: Result, now: dt.datetime, policy: Backof
 # --- the job as it was
 
 
+_JOB = TypeAdapter(Job)
+
+
 def snapshot_of(job: Job) -> dict[str, Any]:
     """All that a message says of a job, as plain JSON values; without its inputs, settings and lease."""
     small = dataclasses.replace(job.request, tiles=(), footprints=None, guides=None, settings={}, subscriber=None)
-    values = {field.name: getattr(job, field.name) for field in dataclasses.fields(job)}
-    values |= {"request": small.as_dict(), "status": job.status.value, "lease_owner": None, "lease_until": None}
-    if job.failure is not None:
-        values["failure"] = {"fault": job.failure.fault.value, "detail": job.failure.detail}
-    return {name: value.isoformat() if isinstance(value, dt.datetime) else value for name, value in values.items()}
+    found: dict[str, Any] = _JOB.dump_python(
+        dataclasses.replace(job, request=small, lease_owner=None, lease_until=None), mode="json"
+    )
+    return found
 
 
 def job_of(snapshot: Mapping[str, Any]) -> Job:
     """The inverse of `snapshot_of`."""
-    values = dict(snapshot)
-    for name, value in snapshot.items():
-        if name.endswith("_at") and value is not None:
-            values[name] = dt.datetime.fromisoformat(value)
-    values |= {"request": JobRequest.from_dict(snapshot["request"]), "status": JobStatus(snapshot["status"])}
-    failure = snapshot["failure"]
-    if failure is not None:
-        values["failure"] = JobFailure(fault=Fault(failure["fault"]), detail=failure["detail"])
-    return Job(**values)
+    return _JOB.validate_python(snapshot)

@@ -18,7 +18,10 @@ if TYPE_CHECKING:
 @takes_options("classify")
 def classify(
     tiles: Annotated[
-        list[str], typer.Argument(metavar="TILES", help="LAS, LAZ, COPC, PLY or ASCII files, or folders of them.")
+        list[str],
+        typer.Argument(
+            metavar="TILES", help="Point files (LAS, LAZ, …: docs/reference/formats.md), or folders of them."
+        ),
     ],
     out: Annotated[str, typer.Option(metavar="DIR", help="The folder to write: one LAZ file per input.")],
     rasters: Annotated[

@@ -6,8 +6,17 @@ from typing import Annotated, Any
 
 import typer
 
-from pipeline.cli.options import LogJson, MetricsHost, MetricsPort, takes_options
+from pipeline.cli.options import takes_options
 from pipeline.console import Console
+
+MetricsPort = Annotated[
+    int | None,
+    typer.Option(metavar="N", min=1, max=65535, help="Show metrics for Prometheus on this port, at /metrics."),
+]
+MetricsHost = Annotated[
+    str, typer.Option(metavar="ADDRESS", help="Address of these metrics: anyone who reaches it can read them.")
+]
+LogJson = Annotated[bool, typer.Option("--log-json", help="Log one JSON object per line, like GABLEWORK_LOG_JSON=1.")]
 
 
 @takes_options("worker")
@@ -20,7 +29,7 @@ def worker(
         str, typer.Option(metavar="BYTES", help="Memory of the process, such as 4GiB; auto, or 0 for none.")
     ] = "auto",
     local_directory: Annotated[
-        str | None, typer.Option(metavar="DIR", help="Where the worker keeps its own files; default temporary.")
+        str | None, typer.Option(metavar="DIR", help="Folder of the worker's own files; default temporary.")
     ] = None,
     name: Annotated[str | None, typer.Option(help="Name in the scheduler's lists; default its address.")] = None,
     host: Annotated[

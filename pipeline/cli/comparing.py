@@ -6,7 +6,8 @@ from typing import Annotated, Any
 
 import typer
 
-from pipeline.cli.options import AsJson, AsSurveyed, Overwrite, Points, Quiet, SettingsFile, Truth, takes_options
+from pipeline.cli.measuring import AsSurveyed, Points, Truth
+from pipeline.cli.options import AsJson, Overwrite, Quiet, SettingsFile, takes_options
 from pipeline.console import Console, ExitCode
 from pipeline.runtime.isolation.preloading import start_early
 
@@ -15,7 +16,9 @@ from pipeline.runtime.isolation.preloading import start_early
 def compare(
     tiles: Annotated[
         list[str],
-        typer.Argument(metavar="TILES", help="LAS, LAZ, COPC, PLY, ASCII files; folders, URLs, tile indexes."),
+        typer.Argument(
+            metavar="TILES", help="Point files (LAS, LAZ, …: docs/reference/formats.md); folders, URLs, tile indexes."
+        ),
     ],
     methods: Annotated[
         list[str],

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pipeline.cli.options import AsJson, AsSurveyed, Points, Quiet, SettingsFile, Truth, takes_options
+from pipeline.cli.options import AsJson, Quiet, SettingsFile, takes_options
 from pipeline.cli.summary import show_statistics
 from pipeline.console import Console
 from pipeline.errors import SettingsError
@@ -17,11 +17,25 @@ if TYPE_CHECKING:
     from pipeline.ruler.evaluation.evaluate import Evaluation
 
 
+Truth = Annotated[
+    str | None, typer.Option(metavar="DIR", help="The truth that simulate wrote: measure the models against it.")
+]
+Points = Annotated[
+    list[str] | None,
+    typer.Option(metavar="TILE", help="A classified tile to measure against; repeat --points for several."),
+]
+AsSurveyed = Annotated[
+    bool, typer.Option("--as-surveyed", help="Move each true building by the shift of the strips that saw it.")
+]
+
+
 @takes_options("inspect")
 def inspect(
     tile: Annotated[
         str,
-        typer.Argument(metavar="TILE", help="A LAS, LAZ, COPC, PLY or ASCII file; or a run directory."),
+        typer.Argument(
+            metavar="TILE", help="A point file (LAS, LAZ, …: docs/reference/formats.md); or a run directory."
+        ),
     ],
     settings: SettingsFile = None,
     as_json: AsJson = False,

@@ -17,7 +17,9 @@ from pipeline.runtime.isolation.preloading import start_early
 def reconstruct(
     tiles: Annotated[
         list[str],
-        typer.Argument(metavar="TILES", help="LAS, LAZ, COPC, PLY, ASCII files; folders, URLs, tile indexes."),
+        typer.Argument(
+            metavar="TILES", help="Point files (LAS, LAZ, …: docs/reference/formats.md); folders, URLs, tile indexes."
+        ),
     ],
     out: Annotated[
         str, typer.Option(metavar="RUN", help="The run directory to write; a folder, or s3://bucket/prefix.")

@@ -15,24 +15,6 @@ Command = TypeVar("Command", bound=Callable[..., None])
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON document; events as JSON lines on stderr.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="No progress; warnings and errors only.")]
 SettingsFile = Annotated[str | None, typer.Option(metavar="FILE", help="Settings as TOML; docs/reference/settings.md.")]
-MetricsPort = Annotated[
-    int | None,
-    typer.Option(metavar="N", min=1, max=65535, help="Show metrics for Prometheus on this port, at /metrics."),
-]
-MetricsHost = Annotated[
-    str, typer.Option(metavar="ADDRESS", help="Address of these metrics: anyone who reaches it can read them.")
-]
-LogJson = Annotated[bool, typer.Option("--log-json", help="Log one JSON object per line, like GABLEWORK_LOG_JSON=1.")]
-Truth = Annotated[
-    str | None, typer.Option(metavar="DIR", help="The truth that simulate wrote: measure the models against it.")
-]
-Points = Annotated[
-    list[str] | None,
-    typer.Option(metavar="TILE", help="A classified tile to measure against; repeat --points for several."),
-]
-AsSurveyed = Annotated[
-    bool, typer.Option("--as-surveyed", help="Move each true building by the shift of the strips that saw it.")
-]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing run.")]
 _MAX_WORKERS = 1024
 

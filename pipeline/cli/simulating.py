@@ -121,7 +121,7 @@ def warm_up(
         list[str] | None,
         typer.Argument(
             metavar="WHAT",
-            help="What to compile for: reconstruct, simulate, evaluate, classify, terrain, compare, diff, solar or "
+            help="Commands to compile for: reconstruct, simulate, evaluate, classify, terrain, compare, diff, solar or "
             "all; default reconstruct by the default method.",
         ),
     ] = None,

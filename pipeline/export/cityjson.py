@@ -21,18 +21,6 @@ from pipeline.model import BuildingResult, FaceKind, FloatArray, Plane, Solid
 VERSION = "2.0"
 """Version of CityJSON."""
 
-ATTRIBUTE_TYPES: Mapping[str, str] = {
-    "string": "string",
-    "bool": "boolean",
-    "int32": "number",
-    "int64": "number",
-    "double": "number",
-    "timestamp": "string, ISO 8601",
-    "binary": "none",
-    "list": "array",
-}
-"""The type of JSON that the columns of a record have as attributes; geometries are not attributes."""
-
 _NOT_ATTRIBUTES = ("building_id", "geometry", *SHAPE_COLUMNS)
 
 

@@ -7,13 +7,17 @@ from these lists. A column has the same name in every format; `docs/reference/co
 from __future__ import annotations
 
 import dataclasses
+import datetime as dt
+import json
 from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-import pyarrow as pa
+if TYPE_CHECKING:
+    import pyarrow as pa
 
-TEXT, BOOL, INT32, INT64, FLOAT64 = pa.string(), pa.bool_(), pa.int32(), pa.int64(), pa.float64()
-TIME, WKB = pa.timestamp("us", tz="UTC"), pa.binary()
-INT32S, TEXTS, FLOAT64S = pa.list_(INT32), pa.list_(TEXT), pa.list_(FLOAT64)
+TEXT, BOOL, INT32, INT64, FLOAT64, TIME, WKB = "string", "bool", "int32", "int64", "double", "timestamp", "binary"
+INT32S, TEXTS, FLOAT32S, FLOAT64S = f"list {INT32}", f"list {TEXT}", "list float", f"list {FLOAT64}"
+"""Types of columns, as Arrow's in `arrow_type`: the names alone need not load it."""
 
 NONE = ""
 """Unit of what has none."""
@@ -29,8 +33,8 @@ class Column:
 
     name: str
     """Its name, the same in every format."""
-    kind: pa.DataType
-    """Its type in the run's own tables."""
+    word: str
+    """Its type in the run's own tables, in a word."""
     unit: str
     """Its unit; empty if it has none."""
     meaning: str
@@ -39,6 +43,11 @@ class Column:
     """The page that says more, relative to docs/reference; empty if there is none."""
     required: bool = dataclasses.field(default=False, kw_only=True)
     """Whether every row has a value."""
+
+    @property
+    def kind(self) -> pa.DataType:
+        """Its type in the run's own tables."""
+        return arrow_type(self.word)
 
     @property
     def comment(self) -> str:
@@ -170,7 +179,7 @@ BUILDINGS = (
         "footprint_share",
         FLOAT64,
         SHARE,
-        "plan area over that of the given footprint: 1 if the model fills it, less if a part without points "
+        "plan area over the area of the given footprint: 1 if the model fills it, less if a part without points "
         "was left out, more only if a block uses its convex hull; null without a given footprint or without a"
         " model",
         page="../methods/solids.md#parts-without-points",
@@ -190,8 +199,8 @@ BUILDINGS = (
         "detection_confidence",
         FLOAT64,
         SHARE,
-        "probability, from 0 to 1, that this object is a building; of a block that of the doubtful "
-        "model that it replaced; null for other blocks, without a model, and if a given "
+        "probability, from 0 to 1, that this object is a building; for a block the confidence of the doubtful model "
+        "that it replaced; null for other blocks, without a model, and if a given "
         "footprint or an override (`accept`, `footprint`) says that it is one",
         page="records.md#confidence-of-a-detection",
     ),
@@ -265,7 +274,7 @@ BUILDINGS = (
         "bic_margin",
         FLOAT64,
         NONE,
-        "information criterion of the other form (templates or arrangement) minus that of the chosen form; "
+        "information criterion of the other form (templates or arrangement) minus the chosen form's; "
         "negative if the better one made no valid solid; null if none competed or a third form was delivered",
     ),
     Column(
@@ -363,6 +372,40 @@ BUILDINGS = (
     Column("engine_version", TEXT, NONE, "version of gablework", required=True),
 )
 """One row per candidate."""
+
+SHOWN: Mapping[str, Mapping[str, tuple[str, int]]] = {
+    "Height": {
+        "height_m": ("Ridge above floor", 2),
+        "ground_z": ("Ground", 2),
+        "eave_z": ("Eaves", 2),
+        "ridge_z": ("Ridge", 2),
+        "h_50p": ("Median of the roof", 2),
+    },
+    "Size": {
+        "footprint_area_m2": ("Footprint", 1),
+        "roof_area_m2": ("Roof, slanted", 1),
+        "volume_m3": ("Volume", 0),
+        "n_planes": ("Roof planes", 0),
+    },
+    "Fit to the points": {
+        "share_within_0_2m": ("Within 0.2 m of the roof", 1),
+        "rmse_m": ("RMSE", 3),
+        "p95_m": ("95th percentile", 3),
+        "coverage": ("Points covered", 1),
+        "share_below_roof": ("Points on facades and below", 1),
+        "footprint_share": ("Given footprint covered", 1),
+        "noise_m": ("Noise of the points", 3),
+        "ridge_z_sigma_m": ("Ridge uncertainty (one sigma)", 3),
+        "unexplained_m2": ("Roof unexplained by points", 1),
+        "extrapolated_share": ("Roof that was not seen", 1),
+        "largest_hole_m": ("Largest hole in the points", 1),
+        "detection_confidence": ("Confidence that it is a building", 1),
+        "n_points": ("Points", 0),
+        "density_per_m2": ("Density", 1),
+    },
+}
+"""The columns of a building that the page shows, by section: label and digits; a share is shown in percent."""
+
 
 PLANES = (
     Column("building_id", TEXT, NONE, "the building", required=True),
@@ -478,7 +521,7 @@ DECISIONS = (
         "bic_margin",
         FLOAT64,
         NONE,
-        "by how much the information criterion is below that of the form it competed with; negative where it is above",
+        "information criterion of the form it competed with minus its own; negative where its own is higher",
     ),
     Column("validity_codes", INT32S, NONE, "codes of the faults of an `invalid` form", required=True),
 )
@@ -502,21 +545,68 @@ TILE_COLUMN = Column("tile", TEXT, NONE, "key of the tile on the lattice, such a
 """The column that the names of a run's folders hold; other formats have it as a column of its own."""
 
 
-KINDS = ("string", "bool", "int32", "int64", "double", "timestamp", "binary", "list")
-"""The types of all columns by their names (`kind_of`); every format says what it makes of each."""
+class OtherTypes(NamedTuple):
+    """What a type of the tables becomes in other formats: a word for it, and what is in it."""
+
+    geopackage: str
+    """The type of SQL."""
+    tiles: str
+    """Type, and component or content, in a property table of 3D Tiles. Whole numbers of 64 bits become floating-point
+    numbers, exact to 2^53, since JavaScript would have them as BigInt, which does not mix with numbers."""
+    pmtiles: str
+    """The type of a value in vector tiles; a null is a property that is not there."""
+    cityjson: str
+    """The type of JSON of an attribute; geometries are none."""
+
+
+KINDS: Mapping[str, OtherTypes] = {
+    "string": OtherTypes("TEXT", "STRING", "string", "string"),
+    "bool": OtherTypes("BOOLEAN", "BOOLEAN", "bool", "boolean"),
+    "int32": OtherTypes("MEDIUMINT", "SCALAR, INT32", "int", "number"),
+    "int64": OtherTypes("INTEGER", "SCALAR, FLOAT64", "int", "number"),
+    "double": OtherTypes("REAL", "SCALAR, FLOAT64", "double", "number"),
+    "timestamp": OtherTypes("DATETIME", "STRING, ISO 8601", "string, ISO 8601", "string, ISO 8601"),
+    "binary": OtherTypes("BLOB", "none", "none", "none"),
+    "list": OtherTypes("TEXT", "STRING, a JSON array", "string, a JSON array", "array"),
+}
+"""The types of all columns by their names (`kind_of`)."""
+
+
+def text_of(value: Any) -> str | None:
+    """A text, a time (ISO 8601) or a list (JSON) for formats that have no type for the latter; None stays None."""
+    if value is None or isinstance(value, str):
+        return value
+    return value.isoformat() if isinstance(value, dt.datetime) else json.dumps(value, separators=(",", ":"))
+
+
+def arrow_type(word: str) -> pa.DataType:
+    """The Arrow type of a word.
+
+    >>> arrow_type(INT32S)
+    ListType(list<item: int32>)
+    """
+    import pyarrow as pa
+
+    if word.startswith("list "):
+        return pa.list_(arrow_type(word.removeprefix("list ")))
+    return pa.timestamp("us", tz="UTC") if word == TIME else pa.type_for_alias(word)
 
 
 def schema_of(columns: Iterable[Column]) -> pa.Schema:
     """The Arrow schema of some columns, in their order."""
+    import pyarrow as pa
+
     return pa.schema([pa.field(one.name, one.kind, nullable=not one.required) for one in columns])
 
 
 def kind_of(kind: pa.DataType) -> str:
     """The name of a column's type in the reference and in the mappings of the formats.
 
-    >>> kind_of(pa.list_(pa.int32())), kind_of(pa.timestamp("us", tz="UTC")), kind_of(pa.uint64())
-    ('list', 'timestamp', 'uint64')
+    >>> [kind_of(arrow_type(word)) for word in (INT32S, TIME, FLOAT64)]
+    ['list', 'timestamp', 'double']
     """
+    import pyarrow as pa
+
     if pa.types.is_timestamp(kind):
         return "timestamp"
     return "list" if pa.types.is_list(kind) else str(kind)

@@ -137,7 +137,11 @@ def parquet_bytes(table: pa.Table) -> bytes:
 def table_files(
     run_dir: str, table_name: str, filesystem: pafs.FileSystem, tiles: Sequence[str] | None = None
 ) -> list[str]:
-    """The files of one table of a run, sorted; the arguments are those of `table_dataset`."""
+    """The files of one table of a run, sorted.
+
+    If the keys of the `tiles` that have files are given, the files are not looked for. The other arguments are those of
+    `table_dataset`.
+    """
     folder = f"{str(run_dir).rstrip('/')}/{table_name}"
     if tiles is not None:
         return [f"{folder}/tile={tile}/part-0.parquet" for tile in tiles]
@@ -195,20 +199,14 @@ def _holds(found: pa.Schema, wanted: pa.Schema, columns: Sequence[str]) -> bool:
     return all(column in found.names and found.field(column).type == wanted.field(column).type for column in columns)
 
 
-def table_dataset(
-    run_dir: str,
-    table_name: str,
-    filesystem: pafs.FileSystem | None = None,
-    tiles: Sequence[str] | None = None,
-) -> pads.Dataset:
+def table_dataset(run_dir: str, table_name: str, filesystem: pafs.FileSystem | None = None) -> pads.Dataset:
     """All files of one table of a run, `tile` added as a text column from the folders' names.
 
-    The run directory is a local path, or a path of `filesystem`. If the keys of the `tiles` that have files are given,
-    the files are not looked for. Raises RunError if the folder does not exist.
+    The run directory is a local path, or a path of `filesystem`. Raises RunError if the folder does not exist.
     """
     filesystem = filesystem or pafs.LocalFileSystem()
     schema = stored_schema(table_name).append(pa.field("tile", pa.string()))
-    return files_dataset(table_files(run_dir, table_name, filesystem, tiles), schema, filesystem)
+    return files_dataset(table_files(run_dir, table_name, filesystem), schema, filesystem)
 
 
 def read_table(run_dir: str, table_name: str, filesystem: pafs.FileSystem | None = None) -> pa.Table:

@@ -19,7 +19,8 @@ from typing import Any
 import numpy as np
 
 from pipeline.compiler import kernel
-from pipeline.export.glb_container import INDICES, VERSION, VERTICES, container
+from pipeline.export.glb_arrays import bounds_of, gltf_axes, values_of
+from pipeline.export.glb_container import INDICES, VERTICES, GlbFile
 from pipeline.model import FloatArray, IntArray
 from pipeline.triangulation.faces import DONE, area_vector, triangulate_rings
 
@@ -36,7 +37,6 @@ PLANE_ID = "_PLANE_ID"
 """Vertex attribute: `plane_id` of the roof plane, -1 on walls and ground."""
 
 _MM = 1000
-_FLOAT, _UNSIGNED_INT = 5126, 5125
 _AXES = (
     "metres from origin_m: x easting, y elevation, z minus northing; "
     "easting = (origin_m[0] + x) / horizontal_unit_m, northing = (origin_m[1] - z) / horizontal_unit_m, "
@@ -172,11 +172,6 @@ def record_level(feature: Mapping[str, Any]) -> str:
     return level
 
 
-def gltf_axes(xyz: FloatArray) -> FloatArray:
-    """East, north, up to x, y up, z minus north: a turn, so that outward stays outward; (n, 3)."""
-    return np.column_stack((xyz[:, 0], xyz[:, 2], 0.0 - xyz[:, 1]))
-
-
 @kernel
 def _triangulated(
     corners: IntArray, ring_starts: IntArray, face_starts: IntArray
@@ -212,28 +207,26 @@ def _triangulated(
 
 
 class _Scene:
-    """The nodes, meshes and buffers of a file, filled building by building."""
+    """The nodes, meshes and buffers of a file, filled building by building; all components have four bytes."""
 
     def __init__(self) -> None:
+        self._file = GlbFile()
         self._nodes: list[dict[str, Any]] = []
         self._meshes: list[dict[str, Any]] = []
-        self._accessors: list[dict[str, Any]] = []
-        self._views = [_View(stride=12), _View(stride=12), _View(stride=4), _View(stride=None)]
+        self._views = [bytearray() for _ in range(4)]
 
     def add(self, name: str, extras: Mapping[str, Any], mesh: SolidMesh, origin_mm: IntArray) -> None:
         """Append a building."""
-        positions, normals, planes, indices = self._views
         corners = gltf_axes(mesh.local_mm / _MM).astype("<f4")
-        bounds = {f: [float(v) for v in getattr(corners, f)(axis=0)] for f in ("min", "max")}
         attributes = {
-            "POSITION": self._accessor(positions, corners, "VEC3", _FLOAT, **bounds),
-            "NORMAL": self._accessor(normals, gltf_axes(mesh.normals).astype("<f4"), "VEC3", _FLOAT),
-            PLANE_ID: self._accessor(planes, mesh.planes.astype("<f4"), "SCALAR", _FLOAT),
+            "POSITION": self._accessor(0, corners, "VEC3", **bounds_of(corners)),
+            "NORMAL": self._accessor(1, gltf_axes(mesh.normals).astype("<f4"), "VEC3"),
+            PLANE_ID: self._accessor(2, mesh.planes.astype("<f4"), "SCALAR"),
         }
         primitives = [
             {
                 "attributes": attributes,
-                "indices": self._accessor(indices, triangles.astype("<u4").reshape(-1), "SCALAR", _UNSIGNED_INT),
+                "indices": self._accessor(3, triangles.astype("<u4").reshape(-1), "SCALAR"),
                 "material": list(MATERIALS).index(surface),
                 "extras": {"part": part},
             }
@@ -244,57 +237,27 @@ class _Scene:
         self._meshes.append({"name": name, "primitives": primitives})
         self._nodes.append(node)
 
-    def _accessor(self, view: _View, values: Any, kind: str, component: int, **more: Any) -> int:
+    def _accessor(self, view: int, values: Any, kind: str, **more: Any) -> int:
         """Append values to a view; the number of their accessor."""
-        self._accessors.append(
-            {
-                "bufferView": self._views.index(view),
-                "byteOffset": view.size,
-                "componentType": component,
-                "count": len(values),
-                "type": kind,
-                **more,
-            }
-        )
-        view.append(values.tobytes())
-        return len(self._accessors) - 1
+        place = len(self._views[view])
+        self._views[view] += values.tobytes()
+        return self._file.accessor(view, byteOffset=place, **values_of(values, kind), **more)
 
     def file(self, title: str, place: Mapping[str, Any]) -> bytes:
         """The whole file."""
-        views, start = [], 0
-        for view in self._views:
-            span = {"buffer": 0, "byteOffset": start, "byteLength": view.size}
-            layout = {"target": INDICES} if view.stride is None else {"byteStride": view.stride, "target": VERTICES}
-            views.append({**span, **layout})
-            start += view.size
+        *vertices, indices = map(bytes, self._views)
+        for data, stride in zip(vertices, (12, 12, 4), strict=True):
+            self._file.view(data, byteStride=stride, target=VERTICES)
+        self._file.view(indices, target=INDICES)
         root = {"name": title, "children": list(range(1, len(self._nodes) + 1)), "extras": dict(place)}
-        document = {
-            "asset": {"version": VERSION, "generator": "gablework", "extras": {"title": title, **place}},
-            "scene": 0,
-            "scenes": [{"name": title, "nodes": [0]}],
-            "nodes": [root, *self._nodes],
-            "meshes": self._meshes,
-            "materials": materials(
-                {primitive["material"] for mesh in self._meshes for primitive in mesh["primitives"]}
-            ),
-            "accessors": self._accessors,
-            "bufferViews": views,
-            "buffers": [{"byteLength": start}],
-        }
-        return container(document, (piece for view in self._views for piece in view.pieces))
-
-
-class _View:
-    """The bytes of one bufferView: all components have four bytes, so all is aligned."""
-
-    def __init__(self, stride: int | None) -> None:
-        self.stride = stride
-        self.size = 0
-        self.pieces: list[bytes] = []
-
-    def append(self, data: bytes) -> None:
-        self.pieces.append(data)
-        self.size += len(data)
+        used = {primitive["material"] for mesh in self._meshes for primitive in mesh["primitives"]}
+        return self._file.content(
+            [root, *self._nodes],
+            self._meshes,
+            scene={"name": title, "nodes": [0]},
+            materials=materials(used),
+            asset={"extras": {"title": title, **place}},
+        )
 
 
 def materials(used: Container[int]) -> list[dict[str, Any]]:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, Self
 
 import numpy as np
 import pyarrow as pa
@@ -23,11 +24,23 @@ def with_bbox(columns: Iterable[Column]) -> pa.Schema:
     return schema_of(columns).append(pa.field("bbox", BBOX))
 
 
+@dataclasses.dataclass(frozen=True)
+class ResultTable:
+    """A kind of such a table."""
+
+    columns: tuple[Column, ...]
+    """The columns in their order, without `bbox`."""
+    facts_key: str
+    """The key of the file's metadata that holds the facts, as JSON."""
+
+
 class ResultFile:
     """A file that is being written, one row group or more per tile. The same rows give the same bytes.
 
     Parameters
     ----------
+    table : ResultTable
+        What it holds.
     path : Path
         The file, which no one else reads yet.
     projjson : mapping or None
@@ -36,21 +49,18 @@ class ResultFile:
         Assumptions and facts about the run, as plain JSON values.
     """
 
-    columns: ClassVar[tuple[Column, ...]]
-    """The columns in their order, without `bbox`."""
-    facts_key: ClassVar[str]
-    """The key of the file's metadata that holds the facts, as JSON."""
-
-    def __init__(self, path: Path, projjson: Mapping[str, Any] | None, facts: Mapping[str, Any]) -> None:
-        self._projjson, self._facts = projjson, facts
-        self._schema = with_bbox(self.columns)
+    def __init__(
+        self, table: ResultTable, path: Path, projjson: Mapping[str, Any] | None, facts: Mapping[str, Any]
+    ) -> None:
+        self._table, self._projjson, self._facts = table, projjson, facts
+        self._schema = with_bbox(table.columns)
         self._writer = pq.ParquetWriter(path, self._schema, compression="zstd", store_schema=False)
         self._geo: dict[str, Any] | None = None
         self.rows = 0
 
     def write(self, columns: Mapping[str, Sequence[Any]], faces: Any) -> None:
         """Add the rows of a tile: all `columns` except `bbox`, and their geometries as shapes, (n,)."""
-        arrays = [_array(columns[column.name], column.kind) for column in self.columns]
+        arrays = [_array(columns[column.name], column.kind) for column in self._table.columns]
         self._writer.write_table(pa.Table.from_arrays([*arrays, bbox_column(faces)], schema=self._schema))
         self._geo = _united(self._geo, geo_metadata(faces, self._projjson))
         self.rows += len(faces)
@@ -63,7 +73,7 @@ class ResultFile:
         """Close the file, with what is known only at the end: bounds and types of all geometries."""
         if kind is None:
             geo = self._geo or geo_metadata(np.zeros(0, object), self._projjson)
-            for key, value in (("geo", geo), (self.facts_key, self._facts)):
+            for key, value in (("geo", geo), (self._table.facts_key, self._facts)):
                 self._writer.add_key_value_metadata({key: json.dumps(value, sort_keys=True, separators=(",", ":"))})
         self._writer.close()
 

@@ -11,13 +11,12 @@ from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 import numpy.typing as npt
-from laspy.copc import CopcInfoVlr
 
 from pipeline.errors import UnreadableInputError
 from pipeline.io.records import Readable
 
 if TYPE_CHECKING:
-    import laspy
+    from laspy.copc import CopcInfoVlr
 
     from pipeline.io.records import Window
 
@@ -43,11 +42,8 @@ class OctreeInfo:
     """Bytes of the root page."""
 
 
-def octree_info(header: laspy.LasHeader) -> OctreeInfo | None:
-    """The octree that the first record of the header describes; None where the file is no COPC."""
-    if not header.vlrs or not isinstance(header.vlrs[0], CopcInfoVlr):
-        return None
-    info = header.vlrs[0]
+def octree_info(info: CopcInfoVlr) -> OctreeInfo:
+    """The octree that a record of the header describes."""
     return OctreeInfo(
         x_min=float(info.center[0] - info.halfsize),
         y_min=float(info.center[1] - info.halfsize),

@@ -1,15 +1,86 @@
-"""Which format a file has, by what it begins with and by its name; and which files of a folder are point files."""
+"""Which format a file has, by what it begins with and by its name."""
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
 
 from pipeline.errors import EmptyInputError, UnreadableInputError
 from pipeline.io.locations import is_url
 from pipeline.io.records import Readable
 
-MAGIC = {b"LASF": "las", b"ply\n": "ply", b"ply\r": "ply"}
-"""Formats by their first bytes."""
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PointFormat:
+    """A format of point clouds."""
+
+    name: str
+    words: str
+    """Its name and its endings, for messages."""
+    media_types: Mapping[str, str]
+    """Media types of files by their endings, the usual one first; empty for an ending that has none of its own."""
+    encodings: Mapping[str, tuple[str, str]]
+    """The names that facts of files have for its variants, with their encoding and media type in STAC."""
+    reader: str
+    """The class that opens a file, "module:class": of a path, facts of the file from before, and `takes`."""
+    takes: tuple[str, ...] = ()
+    """Fields of `ReadOptions` that the reader takes."""
+    count: str = ""
+    """Function that reads the number of points from the header, "module:function"; empty if there is no header."""
+    has_bounds: bool = False
+    """Whether the header has bounds, so that a file is not read through for them."""
+    has_parts: bool = False
+    """Whether a part of a file can be read alone."""
+    magic: tuple[bytes, ...] = ()
+    """First bytes; a format without them is known by its content."""
+
+    @property
+    def suffixes(self) -> tuple[str, ...]:
+        """Endings of its files."""
+        return tuple(self.media_types)
+
+
+FORMATS = (
+    PointFormat(
+        name="las",
+        words="LAS and LAZ (.las, .laz, .copc.laz)",
+        media_types={".las": "application/vnd.las", ".laz": "application/vnd.laszip"},
+        encodings={
+            "las": ("LAS", "application/vnd.las"),
+            "laz": ("LASzip", "application/vnd.laszip"),
+            "copc": ("COPC", "application/vnd.laszip+copc"),
+        },
+        reader="pipeline.io.las:LasFile",
+        count="pipeline.io.las_header:promised_points",
+        has_bounds=True,
+        has_parts=True,
+        magic=(b"LASF",),
+    ),
+    PointFormat(
+        name="ply",
+        words="PLY (.ply)",
+        media_types={".ply": "application/ply"},
+        encodings={"ply": ("PLY", "application/octet-stream")},
+        reader="pipeline.extras.ply_ascii.ply:PlyFile",
+        count="pipeline.extras.ply_ascii.ply:promised_vertices",
+        magic=(b"ply\n", b"ply\r"),
+    ),
+    PointFormat(
+        name="ascii",
+        words="ASCII x y z (.xyz, .txt, .csv, .asc, .pts)",
+        media_types={".xyz": "text/plain", ".txt": "", ".csv": "text/csv", ".asc": "", ".pts": ""},
+        encodings={"ascii": ("text", "text/plain")},
+        reader="pipeline.extras.ply_ascii.ascii:AsciiFile",
+        takes=("ascii_columns",),
+    ),
+)
+"""All formats of points, those with first bytes of their own first."""
+LAS, _, ASCII = FORMATS
+ENCODINGS: Mapping[str, tuple[str, str]] = {name: words for form in FORMATS for name, words in form.encodings.items()}
+"""The encoding and the media type of each `FileFacts.format` in STAC."""
+DIVISIBLE = frozenset(name for form in FORMATS if form.has_parts for name in form.encodings)
+"""Those of files of which a part can be read alone."""
 FOREIGN_MAGIC = {
     b"PK\x03\x04": "a zip archive: unpack it first",
     b"\x1f\x8b": "a gzip file: unpack it first",
@@ -24,9 +95,7 @@ FOREIGN_MAGIC = {
     b"NCOLS": "an ESRI ASCII raster, not points",
 }
 """What is often mistaken for points, and what to do with it."""
-LAS_SUFFIXES = (".las", ".laz")
-ASCII_SUFFIXES = (".xyz", ".txt", ".csv", ".asc", ".pts")
-POINT_SUFFIXES = (*LAS_SUFFIXES, ".ply", *ASCII_SUFFIXES)
+POINT_SUFFIXES = tuple(suffix for form in FORMATS for suffix in form.suffixes)
 GEOJSON_SUFFIXES = (".geojson", ".json")
 """Endings of GeoJSON."""
 LINES_SUFFIXES = (".geojsonl", ".geojsons", ".ndjson")
@@ -52,7 +121,7 @@ UNREAD_VECTORS = {
 """Vector formats that are not read, by ending."""
 CONVERT = "Convert it to GeoPackage (.gpkg)"
 """The fix for a vector format that is not read."""
-VALID = "Valid are LAS and LAZ (.las, .laz, .copc.laz), PLY (.ply) and ASCII x y z (.xyz, .txt, .csv, .asc, .pts)"
+VALID = f"Valid are {', '.join(form.words for form in FORMATS[:-1])} and {FORMATS[-1].words}"
 TEXT_SUFFIXES = (".txt", ".csv", ".lst", ".list")
 """Endings of text files that may be indexes; what they begin with decides."""
 SNIFF_BYTES = 4096
@@ -88,25 +157,21 @@ def first_bytes(path: Readable) -> bytes:
     return head
 
 
-def recognise_format(path: Readable) -> str:
-    """las, ply or ascii; raises UnreadableInputError if the file is none of these, or not what its name says."""
+def recognise_format(path: Readable) -> PointFormat:
+    """The format of a file; raises UnreadableInputError if it is none of `FORMATS`, or not what its name says."""
     head, suffix = first_bytes(path), path.suffix.lower()
-    for magic, name in MAGIC.items():
-        if head.startswith(magic):
-            return name
+    for form in FORMATS:
+        if head.startswith(form.magic):
+            return form
     for magic, what in FOREIGN_MAGIC.items():
         if head.startswith(magic):
             raise UnreadableInputError(str(path), f"this is {what}", VALID)
-    if suffix in LAS_SUFFIXES:
-        raise UnreadableInputError(
-            str(path), f"not a LAS file: it begins with {head[:4]!r}, not b'LASF'", f"Get the file again. {VALID}"
-        )
-    if suffix == ".ply":
-        raise UnreadableInputError(
-            str(path), f"not a PLY file: it begins with {head[:4]!r}, not b'ply'", f"Get the file again. {VALID}"
-        )
-    if b"\0" not in head and (suffix in ASCII_SUFFIXES or looks_like_points(head)):
-        return "ascii"
+    for form in FORMATS:
+        if form.magic and suffix in form.suffixes:
+            what = f"not a {form.name.upper()} file: it begins with {head[:4]!r}, not {form.magic[0].strip()!r}"
+            raise UnreadableInputError(str(path), what, f"Get the file again. {VALID}")
+    if b"\0" not in head and (suffix in ASCII.suffixes or looks_like_points(head)):
+        return ASCII
     raise UnreadableInputError(str(path), f"format not known: it begins with {head[:8]!r}", VALID)
 
 

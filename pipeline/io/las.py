@@ -400,12 +400,12 @@ class LasFile:
 
 
 def _octree_of(header: laspy.LasHeader) -> OctreeInfo | None:
-    """The octree of a COPC file; None for other files."""
+    """The octree of a COPC file, which its first record describes; None for other files."""
     if not header.vlrs or not isinstance(header.vlrs[0], CopcInfoVlr):
         return None
     from pipeline.io.copc import octree_info
 
-    return octree_info(header)
+    return octree_info(header.vlrs[0])
 
 
 def _places(last: int) -> list[int]:

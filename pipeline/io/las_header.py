@@ -8,7 +8,8 @@ from __future__ import annotations
 import dataclasses
 import math
 import struct
-from typing import TYPE_CHECKING, BinaryIO
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, BinaryIO, NamedTuple
 
 from pipeline.errors import EmptyInputError, InconsistentInputError, UnreadableInputError
 from pipeline.io.records import Readable
@@ -68,6 +69,11 @@ class HeaderBlock:
         """Byte at which the room for points ends: the next thing that the header names, or the file's end."""
         later = [at for at in (self.first_evlr, self.waveform_start) if at > self.offset_to_points]
         return min([*later, self.file_size])
+
+
+def promised_points(path: Readable) -> int:
+    """The number of points in the header; raises as `read_header_block`."""
+    return read_header_block(path).point_count
 
 
 def read_header_block(path: Readable) -> HeaderBlock:
@@ -166,20 +172,42 @@ def _check_scales(name: str, values: tuple[float, ...]) -> None:
             )
 
 
-def _wkt_of_extended_records(stream: BinaryIO, block: HeaderBlock) -> str | None:
-    """The WKT in the extended records, without reading the others (waveforms can be gigabytes)."""
-    at = block.first_evlr
+class ExtendedRecord(NamedTuple):
+    """Where an extended variable length record (EVLR) is; it can be gigabytes."""
+
+    user_id: bytes
+    """Who defines it, without the zeros at its end."""
+    record_id: int
+    """Which of theirs it is."""
+    description: bytes
+    """(32 bytes) as in the file."""
+    offset: int
+    """Byte at which its data begin."""
+    size: int
+    """Bytes of data."""
+
+
+def extended_records(stream: BinaryIO, block: HeaderBlock) -> Iterator[ExtendedRecord]:
+    """The extended records of a file in its order, without their data; one that leads out of the file is the last."""
+    end = block.first_evlr
     for _ in range(min(block.evlr_count, EVLR_LIMIT)):
-        if at > block.file_size - EVLR_HEADER_SIZE:
-            return None
-        stream.seek(at)
-        head = stream.read(EVLR_HEADER_SIZE)
-        user_id = head[2:18].split(b"\0")[0]
-        record_id, length = struct.unpack_from("<HQ", head, 18)
-        if user_id == b"LASF_Projection" and record_id == WKT_RECORD_ID and length <= WKT_SIZE_LIMIT:
-            return stream.read(length).rstrip(b"\0").decode("utf-8", errors="replace")
-        at += EVLR_HEADER_SIZE + length
-    return None
+        stream.seek(end)
+        head = stream.read(EVLR_HEADER_SIZE).ljust(EVLR_HEADER_SIZE, b"\xff")
+        record_id, size = struct.unpack_from("<HQ", head, 18)
+        start = end + EVLR_HEADER_SIZE
+        yield ExtendedRecord(head[2:18].split(b"\0")[0], record_id, head[28:60], start, size)
+        end = start + size
+        if end > block.file_size:
+            return
+
+
+def _wkt_of_extended_records(stream: BinaryIO, block: HeaderBlock) -> str:
+    """The WKT in the extended records, without reading the others (waveforms can be gigabytes); empty without any."""
+    for one in extended_records(stream, block):
+        if (one.user_id, one.record_id) == (b"LASF_Projection", WKT_RECORD_ID) and one.size <= WKT_SIZE_LIMIT:
+            stream.seek(one.offset)
+            return stream.read(one.size).rstrip(b"\0").decode("utf-8", errors="replace")
+    return ""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -204,7 +232,7 @@ def header_crs(path: Readable, header: laspy.LasHeader, block: HeaderBlock) -> H
     texts = [vlr.string for vlr in header.vlrs.get("WktCoordinateSystemVlr")]
     if block.evlr_count:
         with path.open("rb") as stream:
-            texts.append(_wkt_of_extended_records(stream, block) or "")
+            texts.append(_wkt_of_extended_records(stream, block))
     crs = None
     for text in texts:
         if crs is None and text.strip(" \0"):

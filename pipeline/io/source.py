@@ -7,7 +7,7 @@ import datetime as dt
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import shapely
@@ -16,14 +16,14 @@ from pipeline.errors import CrsError, InconsistentInputError, SettingsError
 from pipeline.io.area_of_use import Location, location_of
 from pipeline.io.crs import SpatialReference
 from pipeline.io.crs_resolution import resolve_reference
-from pipeline.io.formats import recognise_format
+from pipeline.io.formats import DIVISIBLE, PointFormat, recognise_format
 from pipeline.io.gps_time import GpsTimeKind, utc_of
 from pipeline.io.places import file_at
 from pipeline.io.reading import one_input
 from pipeline.io.records import DivisibleFile, FileFacts, FileStatus, PointFile, PointRecords, Readable, Share, Window
 from pipeline.io.strays import MOST_STRAYS, ROUNDING, off_earth, without_strays
 from pipeline.model import BoolArray, ByteArray, FloatArray, PointCloud
-from pipeline.registry import extra
+from pipeline.registry import loaded
 
 if TYPE_CHECKING:
     from shapely import MultiPolygon, Polygon
@@ -139,7 +139,7 @@ class SourceInfo:
     @property
     def is_divisible(self) -> bool:
         """Whether each share of it can be read alone: text can only be read from its first line on."""
-        return self.format in {"las", "laz", "copc"}
+        return self.format in DIVISIBLE
 
     @property
     def location(self) -> Location | None:
@@ -200,35 +200,11 @@ class Findings:
         return tuple(found)
 
 
-class Reader(Protocol):
-    """Opens a file of one format; faster with the facts of the same file, opened before."""
-
-    def __call__(self, path: Readable, options: ReadOptions, facts: FileFacts | None = None, /) -> PointFile:
-        """The opened file."""
-
-
-def _open_las(path: Readable, _options: ReadOptions, facts: FileFacts | None = None, /) -> PointFile:
-    from pipeline.io.las import LasFile
-
-    return LasFile(path, facts)
-
-
-def _open_ply(path: Readable, _options: ReadOptions, facts: FileFacts | None = None, /) -> PointFile:
-    file: PointFile = extra("PlyFile")(path, facts)
+def opened_as(form: PointFormat, path: Readable, options: ReadOptions, facts: FileFacts | None = None) -> PointFile:
+    """A file of a format, opened; faster with the facts of the same file, opened before."""
+    taken = {name: getattr(options, name) for name in form.takes}
+    file: PointFile = loaded(form.reader)(path, facts=facts, **taken)
     return file
-
-
-def _open_ascii(path: Readable, options: ReadOptions, facts: FileFacts | None = None, /) -> PointFile:
-    file: PointFile = extra("AsciiFile")(path, options.ascii_columns, facts)
-    return file
-
-
-READERS: dict[str, Reader] = {
-    "las": _open_las,
-    "ply": _open_ply,
-    "ascii": _open_ascii,
-}
-"""The reader of each format; imports wait until a file of the format is opened."""
 
 
 class Source:
@@ -245,7 +221,7 @@ class Source:
         self._options = options
         if known is not None and not known.is_of(path):
             known = None
-        self._file = READERS[recognise_format(path)](path, options, None if known is None else known.facts)
+        self._file = opened_as(recognise_format(path), path, options, None if known is None else known.facts)
         self._info = _info_of(path, self._file, options) if known is None else known
         self.findings = Findings()
         """What the last pass of `chunks` found."""

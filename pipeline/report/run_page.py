@@ -16,7 +16,8 @@ import shapely
 from pipeline.errors import RunError
 from pipeline.export.geoparquet import table_dataset
 from pipeline.io import arrow_at, storage_at
-from pipeline.model import REASONS, Reason, Status
+from pipeline.model import Reason, Status
+from pipeline.reasons import REASONS
 from pipeline.report.class_map import MAX_DRAWN, ROWS, ClassMap, MapClass
 from pipeline.report.maps import BAD, DOUBTFUL, FAIR, GOOD, MISSING, NO_FIGURE
 from pipeline.report.page_template import page_template
@@ -230,7 +231,7 @@ def _cards(manifest: RunManifest, statistics: Mapping[str, Any]) -> list[tuple[s
 
 def _meaning(reason: str) -> str:
     """The meaning of a reason; empty for one of a later version."""
-    return REASONS[Reason(reason)] if reason in set(Reason) else ""
+    return REASONS[Reason(reason)].meaning if reason in set(Reason) else ""
 
 
 def _reasons(statistics: Mapping[str, Any], seen: _Seen) -> list[tuple[str, str, str, int, str, list[str]]]:

@@ -1,9 +1,9 @@
 """Straight borders between roof faces: ridges where planes cross, steps along fitted lines.
 
-The borders of a partition are arcs between nodes, where three or more borders meet. An arc is cut into runs; one along
-which the two planes cross takes their line of intersection, another the line of least squares through it, turned to
-the building's dominant direction where it is near. Nodes move to where their lines meet, along the outline where they
-lie on it. Arcs of broken faces are put back: the result is a coverage again.
+The borders of a partition are arcs between nodes, where three or more borders meet. An arc is cut into runs. A run
+along which the two planes cross takes their line of intersection; any other run takes its least-squares line, turned to
+a dominant direction of the building if that is near. Nodes move to where their lines meet; nodes on the outline move
+along it. If a face breaks, its arcs are restored, so the result is always a coverage.
 """
 
 from __future__ import annotations

@@ -1,16 +1,16 @@
 """Where the edge of a roof lies, from the points along it.
 
-The outermost points of a sampled edge lie within it. In strips square to the edge the way from the outermost point of a
-strip to the edge is distributed as the way from any line within the roof to the next point inwards: edge and points are
-independent. That way follows from the distances V of successive points in the strips, as the age of a renewal process:
-its mean is E[V^2] / (2 E[V]) (Cox 1962), half a distance where the points are regular, a whole one where they are
-random. So the correction follows the density, the pattern and its direction, measured at the edge itself.
+The outermost points of a sampled edge lie inside it. Edge and points are independent, so in strips square to the edge
+the distance from the outermost point to the edge has the same distribution as the distance from any line within the
+roof to the next point inwards. It follows from the distances V of successive points, as the age of a renewal process:
+its mean is E[V^2] / (2 E[V]) (Cox 1962), half of V for regular points, all of V for random ones. The correction
+therefore follows the density, the pattern and its direction at the edge itself.
 
-The points sample the roof as the scanner sees it, which is larger than the roof: a pulse that meets it with a part of
-its beam also gives a point of the roof. Such a pulse goes on and comes back from below as well, which identifies it:
-split pulses lie in a band along the edge, as wide outside as inside. Their number, over the length of the edge and the
-density of the points, is the width of the band; half of it is the reach of the mixed pulses, by which the edge is drawn
-back. Nothing is drawn back where the file does not record the number of returns.
+The scanner sees the roof larger than it is, since a pulse that meets it with a part of its beam also gives a roof
+point. Such a pulse has a further return from below, which identifies it: split pulses lie in a band along the edge, as
+wide outside as inside. Their number, over the length of the edge and the density of the points, is the width of the
+band; half of it is the reach of the mixed pulses, by which the edge is drawn back. Nothing is drawn back where the file
+does not record the number of returns.
 """
 
 from __future__ import annotations

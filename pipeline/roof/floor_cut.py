@@ -1,7 +1,7 @@
-"""Roof faces that leave the heights in which a roof may lie end there: each is cut along a level line.
+"""Cuts roof faces that leave the permitted range of heights, each along a level line.
 
-The sloping part keeps its plane, what is beyond the line is level, and the neighbours get the ends of the cut, so the
-faces still share their borders.
+The sloping part keeps its plane, the part beyond the line becomes level, and the neighbours get the ends of the cut, so
+the faces still share their borders.
 """
 
 from __future__ import annotations

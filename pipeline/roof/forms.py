@@ -1,4 +1,4 @@
-"""The forms that the roof faces of a building can take, the most wanted first.
+"""The forms that the roof faces of a building can take, the preferred one first.
 
 A form is a function that draws the faces when it is called: a later one costs nothing where an earlier one is valid.
 """

@@ -1,4 +1,4 @@
-"""Which plane each place of the plan belongs to: labels of all points, and samples where there are none."""
+"""The plane of each place of the plan: labels of all points, and samples where there are no points."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ class RoofSettings(Parameters):
     )
     outside_fraction: float = parameter(
         0.21,
-        "Where on the way from a roof point to the nearest empty place the eave lies, without a footprint.",
+        "Place of the eave on the way from a roof point to the nearest empty place, as a share, without a footprint.",
         minimum=0.05,
         maximum=0.95,
     )
@@ -58,7 +58,7 @@ class RoofSettings(Parameters):
     )
     outline: str = parameter(
         "eaves",
-        "Where the outline lies without a footprint: at the eaves, or at the walls that points beneath the eaves show.",
+        "Outline without a footprint: at the eaves, or at the walls that points beneath the eaves show.",
         choices=("eaves", "walls"),
     )
     usual_overhang_m: float = parameter(
@@ -236,7 +236,7 @@ class ArrangementSettings(Parameters):
     )
     face_area_m2: float = parameter(
         2.5,
-        "A roof face must save at least the points that fall on this area, or those of `face_points`.",
+        "A roof face must save at least the points that fall on this area, or `face_points`.",
         unit="m2",
         minimum=0.0,
         maximum=100.0,
@@ -250,7 +250,7 @@ class ArrangementSettings(Parameters):
     )
     corner_share: float = parameter(
         0.5,
-        "Misfitting points that a corner of the borders must save, as a share of those of a roof face; 0 keeps all.",
+        "Misfitting points that a corner of the borders must save, as a share of a roof face's; 0 keeps all.",
         minimum=0.0,
         maximum=10.0,
     )

@@ -1,9 +1,9 @@
 """Roof points in the shadow of a wall: at the foot of a higher part, points of the lower roof count again.
 
-Points with another one well above them nearby are hidden, since most are of a facade. So a lower roof seems to end half
-a metre from the wall, and one that is hardly wider seems to be missing. A facade has points at all heights: those on
-the plane of a roof that goes on beside them are of that roof. At the foot of a wall all higher points are on one side.
-A point that they surround lies beneath the upper roof: under its eave, or met by a pulse through a gap.
+Points with another point well above them nearby are hidden, since most lie on a facade. A lower roof therefore seems to
+end half a metre from the wall, and one that is hardly wider seems to be missing. A facade has points at all heights;
+the ones on the plane of a roof that continues beside them belong to that roof. At the foot of a wall all higher points
+are on one side. A point that they surround lies beneath the upper roof: under its eave, or seen through a gap.
 """
 
 from __future__ import annotations

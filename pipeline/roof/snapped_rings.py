@@ -1,4 +1,4 @@
-"""Rings on the millimetre grid, and how far apart two of them are, without an overlay."""
+"""Rings on the millimetre grid, and the distance between two of them, without an overlay."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Roof faces whose borders are traced between labelled points: ways to draw them, the wanted one first."""
+"""Roof faces whose borders are traced between labelled points: ways to draw them, the preferred one first."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
 Drawn one by one, each unit ends at its own outermost points, which leaves a slit between two houses of a row. Therefore
 the outline is drawn around all units of a candidate, as if they were one building, and divided among them as a roof is
-divided among its planes: amid the points on either side, in straight lines.
+divided among its planes: half-way between the points on either side, in straight lines.
 """
 
 from __future__ import annotations

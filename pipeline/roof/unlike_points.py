@@ -1,6 +1,6 @@
 """Models whose faces contradict the points: one rises where nothing was seen, or one is level where the roof slopes.
 
-Faces are ended and continued such that this seldom happens; what is left is not a model of the roof.
+Faces are cut and continued so that this seldom happens. A model that still contradicts its points is not delivered.
 """
 
 from __future__ import annotations

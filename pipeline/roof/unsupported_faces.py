@@ -1,9 +1,8 @@
-"""Roof faces that go on where no point is: they end at the heights that the points show.
+"""Roof faces that continue beyond their points: they end at the heights that the points show.
 
-A plane says little beyond its last points. Up its slope it may go on by its noise and by its rise over two point
-spacings, the farthest that a ridge lies from its points; what would lie above is level. Down its slope it may go on
-for longer, since an eave that something hides is often there. A face without any point of its own, or under the floor,
-is level as a whole.
+A plane says little beyond its last points. Up its slope it may continue by its noise plus its rise over two point
+spacings, the farthest that a ridge lies from its points; above that it is level. Down its slope it may continue
+farther, since hidden eaves are common. A face without any point of its own, or under the floor, is level as a whole.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""Roof points to roof planes: one file a published segmentation."""
+"""Roof points to roof planes: one file per published segmentation."""

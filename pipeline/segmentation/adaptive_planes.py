@@ -1,9 +1,9 @@
 """Roof planes whose thresholds follow the noise and the density of the points.
 
-A dense cloud is first averaged to nodes, so that the noise is small beside their distance. Of all regions that grow
-from flat seeds those are taken that explain the most (`trial_regions`). Planes that touch are one where an F-test finds
-no difference between them, and every point takes the plane near it that has the company of its neighbours. What is
-left is searched once more: dormers and other superstructures.
+A dense cloud is first averaged to nodes, so that the noise is small compared with their distance. Regions grow from
+flat seeds, and the ones that explain the most are taken (`trial_regions`). Touching planes become one if an F-test
+finds no difference between them, and every point takes the nearby plane that most of its neighbours take. The remaining
+points are searched once more, for dormers and other superstructures.
 """
 
 from __future__ import annotations

@@ -2,7 +2,8 @@
 
 The paper says that clusters of one plane are merged, not by which test. Here two clusters are one plane where the plane
 of their union adds little *systematic* residual to either, and their planes make a small angle. Only clusters that
-touch, or lie within a reach, are compared, in a queue, so that a city block costs about as much a fragment as a house.
+touch, or lie within a reach, are compared, in a queue, so that a cluster costs about the same in a city block as in a
+house.
 """
 
 from __future__ import annotations

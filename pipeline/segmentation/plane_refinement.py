@@ -1,8 +1,8 @@
-"""From the rough clusters of a TIN to roof planes of its points (Shorter and Kasparis, section 3.3).
+"""From the rough clusters of a TIN to the roof planes of its points (Shorter and Kasparis, section 3.3).
 
-Rounds of: best-fit planes of the clusters on the *original* elevations, clusters of one plane merged, points
-reassigned to the planes around them, outliers absorbed. The paper describes these steps; its thresholds are unpublished
-and are settings here.
+Each round fits planes to the clusters on the *original* elevations, merges clusters of one plane, reassigns points to
+the planes around them, and absorbs outliers. The paper describes these steps without their thresholds, which are
+settings here.
 """
 
 from __future__ import annotations

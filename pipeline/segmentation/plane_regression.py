@@ -1,8 +1,8 @@
-"""Best-fit planes z = b0 + b1 x + b2 y by least squares (Shorter and Kasparis, Eqs. 8 to 14), from sums a cluster.
+"""Best-fit planes z = b0 + b1 x + b2 y by least squares (Shorter and Kasparis, Eqs. 8 to 14), from sums per cluster.
 
-All that the regression needs of a cluster are ten sums over its points. The sums of two clusters add up to those of
-their union, so merging needs no second look at the points, and they are taken in the order of the points, so the
-planes do not depend on a linear algebra library.
+The regression needs ten sums over the points of a cluster. The sums of a union are the sums of its two clusters, so
+merging does not read the points again. They are added in the order of the points, so the planes do not depend on a
+linear algebra library.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Which plane a point belongs to: the paper's merging of points with planes, and a vote among neighbours."""
+"""The plane of each point: the paper's merging of points with planes, and a vote among neighbours."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
 """Regions on trial: of all regions that flat seeds can grow, those that explain the most points.
 
 Regions grow over nearest neighbours, with their plane fitted again on the way (Vosselman, Gorte, Sithole and Rabbani
-2004: Recognising structure in laser scanner point clouds). There a seed that was looked at first keeps what it
-reaches; here every region first grows on trial, and the one with the greatest gain is taken. A gain is the sum over a
-region's points of 1 - (distance / limit)^2, the complement of MSAC's cost (Torr and Zisserman 2000).
+2004: Recognising structure in laser scanner point clouds). There the first seed keeps what it reaches; here every
+region first grows on trial, and the one with the greatest gain is taken. The gain of a
+point is 1 - (distance / limit)^2, the complement of MSAC's cost (Torr and Zisserman 2000).
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Decks and roofs between two walls: surfaces with drops on opposite sides, along parallel edges.
 
-Openings take a bridge that meets the road on its level for ground, and a house on a slope whose roof meets the ground
-uphill: on one side there is no step. Across the deck, and across the roof along the contour, the surface ends at a drop
-to the left and to the right, and both edges are parallel. A spur of ground between two brows or the corner of a terrace
-seldom has such edges.
+Openings take two things for ground, since they have no step on one side: a bridge that meets the road on its level, and
+a house on a slope whose roof meets the ground uphill. Across the deck, and across the roof along the contour, the
+surface ends at a drop to the left and to the right, and both edges are parallel. A spur of ground between two brows or
+the corner of a terrace seldom has such edges.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Curved roofs among the patches of a candidate: domes, cones and barrels, each of one quadric surface.
 
-Patches on a curve meet in folds that run anywhere, so the rules for borders between planes part them. A sphere, an
-ellipsoid, a cone and a cylinder are quadrics: the zeros of a polynomial of second degree in x, y and z. Patches that
-bend outwards from one to the next, in many directions, are one roof if one quadric runs through them all. Two planes
-are a quadric, too; the number of directions distinguishes a curve from those.
+Patches on a curve meet in folds that run anywhere, so the rules for borders between planes would separate them. A
+sphere, an ellipsoid, a cone and a cylinder are quadrics: the zeros of a polynomial of second degree in x, y and z.
+Patches that bend outwards from one to the next, in many directions, are one roof if one quadric runs through them all.
+Two planes are a quadric, too; the number of directions distinguishes a curve from those.
 """
 
 from __future__ import annotations

@@ -2,10 +2,10 @@
 
 A deck is level with the ground along two opposite ends, over nearly their whole width, and free along its sides. A
 house on a slope is level at one side only, the lid of an underground garage at three. Trees may hide one end of a
-bridge: then its length shows that it is none of these. The moments of the outline where a surface is level with the
-ground show this, compared with those of its area. For an area with second moments A about its centre, and level
-outline with second moments L about the same place, both per weight, A^-1 L has eigenvalues that no stretching, turning
-or shearing of the scene changes:
+bridge: then its length distinguishes it. The moments of the outline where a surface is level with the ground show this,
+compared with those of its area. For an area with second moments A about its centre, and level outline with second
+moments L about the same place, both per weight, A^-1 L has eigenvalues that no stretching, turning or shearing of the
+scene changes:
 
 - two opposite ends: 3 across them and 1 along them, with the mean of the level outline at the centre;
 - three sides of a square: 2.3 and 1.7; all four sides: 2 and 2;

@@ -1,9 +1,9 @@
-"""Embankments, piers and benches: wide, smooth surfaces that slopes lead up to from the ground.
+"""Embankments, piers and benches: wide, smooth surfaces that slopes connect with the ground.
 
-An opening takes a dam with a retaining wall on one side for a row of houses, and a bench that the edge of the data
-cuts off for a hall. No test of a few cells sees the difference. It lies in the whole surface and its foot: a building
-rises from the ground by walls nearly everywhere, and crowns fall into many surfaces. A surface is terrain if it is
-large, if most of it is wider than a house, and if slopes of about 45 degrees at most lead up to a good part of it.
+An opening takes a dam with a retaining wall on one side for a row of houses, and a bench that the edge of the data cuts
+off for a hall. No test of a few cells sees the difference. It lies in the whole surface and its foot: a building rises
+from the ground by walls nearly everywhere, and crowns fall into many surfaces. A surface is terrain if it is large, if
+most of it is wider than a house, and if slopes of about 45 degrees at most lead up to a good part of it.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Facets of a scene's TIN: their kinds, and which of them neighbouring tiles see too.
+"""The facets of a scene's TIN: their kinds, and which ones neighbouring tiles see, too.
 
-Facets whose elevation difference MX_zdiff reaches 2 m are walls (Shorter and Kasparis, section 3.1). What remains is
-united over shared edges, ground with ground and object with object. All decisions use exact integers, or floats in one
-order: every tile that sees a facet decides the same.
+Facets whose elevation difference MX_zdiff reaches 2 m are walls (Shorter and Kasparis, section 3.1). The other facets
+are united over shared edges, ground with ground and object with object. All decisions use exact integers, or floats in
+one order: every tile that sees a facet decides the same.
 """
 
 from __future__ import annotations

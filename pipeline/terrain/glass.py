@@ -2,8 +2,8 @@
 
 Half of the pulses go through the panes of a greenhouse. In a TIN of the highest points each of them makes a pit with
 walls around it, and the roof falls apart. A square of the lattice with points of a level roof above, and of the ground
-below lies under glass if all squares around it hold roof, too, and most of those near it are like it. Along alleys and
-in courtyards few are. In a wood the upper points are rough.
+below lies under glass if all squares around it hold roof, too, and most of those near it are like it. Along
+alleys and in courtyards, few are. In a wood the upper points are rough.
 """
 
 from __future__ import annotations

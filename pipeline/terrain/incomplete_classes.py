@@ -1,9 +1,9 @@
-"""Undecided vertices on roofs: what class 6 leaves out of a roof, by what surrounds each vertex.
+"""Undecided vertices on roofs: parts that class 6 leaves out, recognised by their surroundings.
 
-A producer's class 6 may lack an overlapping strip (class 12), or what an editor or a filter left undecided (class 1). A
-vertex without a class belongs to the roof if it lies with building vertices around it in one plane. Planes are drawn in
-the windows that judge planarity (`terrain.vegetation`), and look no farther: a wide part that class 6 leaves out is
-judged as a surface of its own, and joins the building along its seam (`terrain.candidates`).
+A producer's class 6 may lack an overlapping strip (class 12), or points that an editor or a filter left undecided
+(class 1). A vertex without a class belongs to the roof if it lies in one plane with building vertices around it. Planes
+are drawn in the windows that judge planarity (`terrain.vegetation`), and look no farther: a wide part that class 6
+leaves out is judged as a surface of its own, and joins the building along its seam (`terrain.candidates`).
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Which ground vertices a scene's TIN needs: those near objects. Open fields and wide streets need none.
+"""The ground vertices that a scene's TIN needs lie near objects. Open fields and wide streets need none.
 
-Surfaces are made of facets whose vertices all stand above the ground, and are judged by the facets beside them. Such a
-facet depends on the vertices in its circumcircle alone, and facets with a wide one are gaps whatever they are. So all
-facets with a vertex that stands above the ground are the same without the ground that lies farther away.
+Surfaces consist of facets whose vertices are all above the ground, and are judged by the facets beside them. Such a
+facet depends only on the vertices in its circumcircle, and facets with a wide circumcircle are gaps in any case. So all
+facets with a vertex above the ground are the same without the ground that lies farther away.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Openings of growing size by octagons, on surfaces with holes.
 
-An opening removes from a surface what is narrower than its structuring element. The elements here are sums of crosses
-and squares of three cells in the ratio that makes a regular octagon. Each element is the one before with one more
-piece: an erosion continues from the last.
+An opening removes all parts of a surface that are narrower than its structuring element. The elements here are sums of
+crosses and squares of three cells in the ratio that makes a regular octagon. Each element is the one before with one
+more piece: an erosion continues from the last.
 """
 
 from __future__ import annotations

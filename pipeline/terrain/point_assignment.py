@@ -1,4 +1,4 @@
-"""Which surface each point of the full cloud belongs to, found in the TIN of the thinned one."""
+"""The surface of each point of the full cloud, found in the TIN of the thinned cloud."""
 
 from __future__ import annotations
 

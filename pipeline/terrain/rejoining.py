@@ -1,8 +1,8 @@
 """Cells that continue the ground beside them: brows, benches and terraces that the openings took for objects.
 
 An object ends at walls on nearly all of its sides. Terrain continues on some side without a step: there the plane
-through the ground beside a cell, drawn on to the cell, meets it. The test is local, and ground that joined carries it
-on, so a bench comes back from the side where it hangs together with the ground.
+through the ground beside a cell, drawn on to the cell, meets it. The test is local, and ground that joined continues
+it, so a bench comes back from the side where it is connected with the ground.
 """
 
 from __future__ import annotations

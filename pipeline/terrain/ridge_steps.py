@@ -1,10 +1,10 @@
-"""Ridge steps: where a gable roof goes on a little higher or lower, one house of a row ends and the next one begins.
+"""Ridge steps: where a gable roof continues a little higher or lower, one house of a row ends and the next one begins.
 
 Houses of one design often differ by a decimetre or two. That is near the noise of single points, so one patch grows
 over several houses. On average over a few metres the step is plain: both slopes step at the same place, by the same
 amount and in the same sense. Solar panels, dormers and gutters show on one slope only, and a shift between two strips
-in plan shows in opposite senses. A ridge that sags or slopes has no place where it steps. Strips differ in elevation,
-so only points of one strip are compared.
+in plan shows in opposite senses. A ridge that sags or slopes steps nowhere. Strips differ in elevation, so only points
+of one strip are compared.
 """
 
 from __future__ import annotations

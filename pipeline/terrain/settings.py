@@ -210,7 +210,7 @@ class SurfaceSettings(Parameters):
     )
     thin_m: float = parameter(
         1.75,
-        "What is lower than min_height_m and thinner than this, between ground on both sides, belongs to no building: "
+        "Objects lower than min_height_m and thinner than this, between ground on both sides, belong to no building: "
         "hedges and garden walls of a metre, and the distance to the ground points beside them. 0 keeps all.",
         unit="m",
         minimum=0.0,
@@ -288,7 +288,7 @@ class CandidateSettings(Parameters):
     )
     min_height_m: float = parameter(
         2.0,
-        "Least height above the terrain; for a pitched roof that of its ridge, estimated from the spread of heights.",
+        "Least height above the terrain; for a pitched roof the ridge's height, estimated from the spread of heights.",
         unit="m",
         minimum=0.5,
         maximum=20.0,
@@ -382,7 +382,7 @@ class UnitSettings(Parameters):
 
     split: str = parameter(
         "ridges",
-        "Where a candidate is split into units: nowhere, at steps, or at steps and at valleys between parallel ridges.",
+        "Places at which a candidate is split into units: none, steps, or steps and valleys between parallel ridges.",
         choices=("nothing", "steps", "ridges"),
     )
     min_step_m: float = parameter(0.2, "Least step between the roofs of two units.", unit="m", minimum=0.1, maximum=5.0)
@@ -425,7 +425,7 @@ class ClassCodeSettings(Parameters):
     )
     undecided: tuple[int, ...] = parameter(
         (0, 1, 12, 19),
-        "Codes without information: such points are judged by their own evidence, as are those of codes in no list.",
+        "Codes without information: such points are judged by their own evidence, as are points with codes in no list.",
         minimum=0,
         maximum=255,
     )

@@ -1,11 +1,11 @@
-"""Ground and plants that are seen through a roof of glass, where a few points lie on a square metre.
+"""Ground and plants that are seen through a roof of glass, with few points per square metre.
 
-Each point of a greenhouse shows the roof or what is beneath it by chance, whatever its neighbours show. Alleys, yards
-and the ground around houses are places: there a low point has low neighbours. So a low vertex lies under glass if
-higher ones surround it, if most of the surrounded higher vertices near it have a low one among their nearest, and if
-low vertices keep no company of their own. Crowns, through which pulses pass by chance as well, are rough.
+In a greenhouse it is chance whether a point lies on the roof or beneath it, whatever its neighbours are. In alleys,
+yards and around houses a low point has low neighbours. So a low vertex lies under glass if higher ones surround it, if
+most of the surrounded higher vertices near it have a low one among their nearest, and if low vertices do not cluster.
+Crowns, through which pulses pass by chance as well, are rough.
 
-What squares hold rules out nearly all of a town or a wood before any neighbour is searched for.
+Counts in squares rule out nearly all of a town or a wood before any neighbour is searched for.
 """
 
 from __future__ import annotations

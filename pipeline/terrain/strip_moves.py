@@ -1,6 +1,6 @@
-"""Flight strips that do not fit: how far they lie above one another, in words, and where whole strips are moved to.
+"""Flight strips that do not fit: the distance between them, in words, and the moves of whole strips.
 
-Strips that differ by more than houses bear are moved, as whole strips, to their common mean.
+If strips lie so far apart that houses would be lost, they move as wholes to their common mean.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""How far the steps of the ground filter and of planarity look: lengths that settings add up.
+"""Distances that the steps of the ground filter and of planarity look; settings add them up.
 
-They are not settings: each belongs to the definition of its step, as a few cells of a lattice or a number of rounds.
+They are not settings: each belongs to the definition of its step, such as a few cells of a lattice or some rounds.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""How flight strips of a survey fit each other, by the smooth places that two of them saw.
+"""How well the flight strips of a survey fit each other, at smooth places that two of them saw.
 
-Squares of the lattice are small enough to be level ground or one roof plane. In each the plane of the last returns of
-one strip is compared with that of another; rough squares, with trees, edges or cars, do not count. First the ids are
-the strips; then the passes of each id, if its GPS times show several. Counts of whole centimetres add up over tiles and
-inputs: the outcome depends on neither tiles, nor workers, nor order.
+Squares of the lattice are small enough to be level ground or one roof plane. In each the planes of the last returns of
+two strips are compared; rough squares, with trees, edges or cars, do not count. First the ids are the strips; then the
+passes of each id, if its GPS times show several. Counts of whole centimetres add up over tiles and inputs: the outcome
+depends on neither tiles, nor workers, nor order.
 """
 
 from __future__ import annotations

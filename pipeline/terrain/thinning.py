@@ -1,7 +1,7 @@
 """Thinning a cloud to the density of the papers: one point per cell of a fine lattice.
 
 A TIN of all points of a dense multi-return cloud shatters, because each wall becomes many small facets. The highest
-last return of each cell keeps roofs up to their edge, drops most of the façade, and lets trees fall apart. Sparse
+last return of each cell keeps roofs up to their edge, drops most of the facade, and lets trees fall apart. Sparse
 clouds pass unchanged.
 """
 

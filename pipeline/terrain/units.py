@@ -2,9 +2,8 @@
 
 A candidate is everything connected above the ground; a row of houses is one. Its roof is divided into planar patches
 (`terrain.roof_patches`). Patches whose planes meet along their border (ridges, hips, valleys of L-shaped houses,
-dormers) belong to one unit; patches with a step between them do not. A part that is small, enclosed by another one like
-dormers and towers, or a lower annex of another one joins that part again. Two exceptions follow from how houses are
-built:
+dormers) belong to one unit; patches with a step between them do not. A part that is small, enclosed by another one
+(dormers, towers), or a lower annex of another one joins it again. Two exceptions follow from how houses are built:
 
 - a step along the contour lines of the roof, as in offset pent roofs and saw-tooth halls, lies within a house: party
   walls run up the slope;

@@ -1,4 +1,4 @@
-"""Evidence for vegetation: how planar the surroundings of a vertex are, and whether its neighbours are crown.
+"""Evidence for vegetation: the planarity of a vertex's surroundings, and crowns among its neighbours.
 
 Roofs are locally planar; crowns are not, and pulses reach through them. Both measures look a fixed distance and use
 integer sums: they are the same in every tile.

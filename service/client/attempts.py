@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import datetime as dt
 import math
-from email.utils import parsedate_to_datetime
 
 from pipeline.backoff import Backoff
 
@@ -27,24 +25,6 @@ def is_passing(status: int, retry_after: str | None) -> bool:
     (True, False, True, False)
     """
     return status in PASSING or (status >= 400 and retry_after is not None)
-
-
-def wanted_pause_s(retry_after: str | None, now: dt.datetime) -> float:
-    """The pause in seconds that a header Retry-After wants; 0 without one, or if it is neither number nor date.
-
-    >>> wanted_pause_s("120", dt.datetime(2026, 3, 1, tzinfo=dt.UTC))
-    120.0
-    >>> wanted_pause_s("Sun, 01 Mar 2026 00:00:30 GMT", dt.datetime(2026, 3, 1, tzinfo=dt.UTC))
-    30.0
-    """
-    text = (retry_after or "").strip()
-    if text.isascii() and text.isdigit():
-        return float(text)
-    try:
-        at = parsedate_to_datetime(text)
-    except ValueError:
-        return 0.0
-    return max(0.0, ((at if at.tzinfo is not None else at.replace(tzinfo=dt.UTC)) - now).total_seconds())
 
 
 class Attempts:

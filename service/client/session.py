@@ -14,9 +14,10 @@ from typing import Any
 from urllib.parse import quote, urlencode, urlsplit
 
 from pipeline import __version__
+from pipeline.backoff import wanted_pause_s
 from pipeline.errors import SettingsError
 from service.client.answers import Problem
-from service.client.attempts import FIRST_CONTACT_S, Attempts, is_passing, wanted_pause_s
+from service.client.attempts import FIRST_CONTACT_S, Attempts, is_passing
 from service.client.errors import (
     BusyError,
     ForbiddenError,

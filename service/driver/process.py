@@ -311,9 +311,7 @@ class Driver:
             The database does not answer.
         """
         settings = self._settings
-        for run in self._store.schedules.tick(
-            max_queued=settings.max_queued, max_queued_per_key=settings.max_queued_per_key
-        ):
+        for run in self._store.schedules.tick(limits=self._settings.queue_limits):
             level = logging.WARNING if run.outcome in {Outcome.MISSED, Outcome.FAILED} else logging.INFO
             line = "schedule %s, %d slots up to %s: %s: %s"
             facts = self._facts | {"schedule": run.schedule_id, "job": run.job_id}

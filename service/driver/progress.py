@@ -6,73 +6,14 @@ import dataclasses
 from collections.abc import Mapping
 from types import MappingProxyType
 
-WEIGHTS = MappingProxyType(
-    {
-        "inputs": 4,
-        "plan": 1,
-        "ingest": 10,
-        "cells": 2,
-        "ground": 3,
-        "split": 18,
-        "join": 1,
-        "outline": 6,
-        "reconstruct": 35,
-        "publish": 4,
-        "octree": 5,
-        "terrain": 1,
-        "formats": 3,
-        "outputs": 7,
-    }
-)
-"""The stages of a job in their order, with their share of the time in percent; measured on city blocks. A job without
-points, terrain or further formats skips their stages."""
+from pipeline.runtime.monitoring.stages import STAGES
 
-CLASSIFY_WEIGHTS = MappingProxyType(
-    {
-        "inputs": 4,
-        "plan": 1,
-        "ingest": 10,
-        "cells": 3,
-        "ground": 4,
-        "split": 21,
-        "join": 1,
-        "outline": 4,
-        "classify": 22,
-        "write": 12,
-        "rasters": 10,
-        "mosaics": 2,
-        "outputs": 6,
-    }
-)
+WEIGHTS = MappingProxyType({stage.name: stage.weight for stage in STAGES if stage.weight})
+"""The stages of a job in their order, with their share of the time in percent. A job without points, terrain or further
+formats skips their stages."""
+CLASSIFY_WEIGHTS = MappingProxyType({stage.name: stage.classify_weight for stage in STAGES if stage.classify_weight})
 """The stages of a classification, likewise."""
-
-WORDS = MappingProxyType(
-    {
-        "compile": "kernels are translated for this machine",
-        "inputs": "inputs are prepared",
-        "plan": "the run is planned",
-        "ingest": "points are read",
-        "cells": "duplicates and outliers are marked",
-        "ground": "the ground is found",
-        "split": "surfaces are found in the tiles",
-        "join": "surfaces are joined across the borders of tiles",
-        "outline": "touching buildings are separated and outlined",
-        "reconstruct": "buildings are modelled",
-        "publish": "tiles are written",
-        "octree": "points are arranged for viewing",
-        "terrain": "the terrain is written",
-        "formats": "further formats are written",
-        "classify": "points are classified",
-        "write": "files are written",
-        "rasters": "rasters are drawn",
-        "mosaics": "rasters are joined",
-        "records": "the runs are compared",
-        "points": "points are read for the pictures",
-        "pictures": "pictures are drawn",
-        "page": "the page is written",
-        "outputs": "outputs are assembled",
-    }
-)
+WORDS = MappingProxyType({stage.name: stage.message for stage in STAGES})
 """Descriptions of stages. Those without a weight belong to a comparison and are short."""
 
 COMPILING = 10

@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Mapping
 
 from pipeline import __version__
+from pipeline.backoff import wanted_pause_s
 from pipeline.runtime.monitoring import tracing
 from service.driver.loops import repeat
 from service.errors import NoSuchOutputError, StoreError, TargetRefusedError
@@ -244,7 +245,7 @@ class Sender:
             duration_ms=_since_ms(began_s),
             status=status,
             error=_fault(status),
-            retry_after_s=_seconds(retry_after),
+            retry_after_s=wanted_pause_s(retry_after),
             body=body,
         )
 
@@ -297,16 +298,6 @@ def _fault(status: int) -> str | None:
     if 300 <= status < 400:
         return f"the receiver answered {status}: redirects are not followed, give the URL to which it leads"
     return f"the receiver answered {status}"
-
-
-def _seconds(retry_after: str | None) -> float:
-    """The header Retry-After; a date is not read.
-
-    >>> _seconds("120"), _seconds("Wed, 21 Oct 2026 07:28:00 GMT")
-    (120.0, 0.0)
-    """
-    is_number = retry_after is not None and retry_after.isascii() and retry_after.isdigit()
-    return float(retry_after) if is_number and retry_after is not None else 0.0
 
 
 def _since_ms(began_s: float) -> int:

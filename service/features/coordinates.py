@@ -78,7 +78,7 @@ class RunCrs:
         self.storage_uri: str | None = None
         """URI of its horizontal part; None without an EPSG code."""
         self.to_degrees: pyproj.Transformer | None = None
-        """The transformation to longitude and latitude; None without one, as of a local CRS."""
+        """The transformation to longitude and latitude; None without one, as in a local CRS."""
         self._known = dict(_ALWAYS)
         if self.whole is not None:
             own = (self.whole.sub_crs_list[0] if self.whole.is_compound else self.whole).to_2d()

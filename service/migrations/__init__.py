@@ -1,4 +1,7 @@
-"""The database's tables, revision by revision (Alembic), run from code: no ini file is needed anywhere."""
+"""The database's tables, revision by revision (Alembic), run from code: no ini file is needed anywhere.
+
+Revisions only go forward: an earlier version works with a backup that was made before the update.
+"""
 
 from __future__ import annotations
 

@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from pipeline.extras.publish.publishing import FORMS
 from service.errors import NoSuchOutputError
 
 GEOPARQUET = "application/vnd.apache.parquet"
@@ -26,10 +27,6 @@ HTML = "text/html"
 """Media type of a page."""
 ZIP = "application/zip"
 """Media type of a zip file."""
-GEOPACKAGE = "application/geopackage+sqlite3"
-"""Media type of GeoPackage."""
-PMTILES = "application/vnd.pmtiles"
-"""Media type of PMTiles."""
 JSON = "application/json"
 """Media type of any other JSON document."""
 
@@ -144,87 +141,18 @@ OUTPUTS = _table(
         "Counts by status, reason and roof type, inputs with sha256, settings and hashes, warnings, timings, and "
         "the digest of the content.",
     ),
-    OutputKind(
-        "3dtiles",
-        JSON,
-        "3dtiles.json",
-        "Models as 3D Tiles",
-        "The tileset for globes such as CesiumJS, if the input publish names 3dtiles: 3D Tiles 1.1 in EPSG:4978, "
-        "with the records. Its files, and a copy of it with paths of its own, are below this output.",
-        form="3dtiles",
-    ),
-    OutputKind(
-        "3dtiles-zip",
-        ZIP,
-        "3dtiles.zip",
-        "Models as 3D Tiles in a zip file",
-        "The same tileset with all its files, to be served elsewhere.",
-        form="3dtiles",
-        is_selectable=True,
-    ),
-    OutputKind(
-        "geopackage",
-        GEOPACKAGE,
-        "models.gpkg",
-        "All tables as GeoPackage",
-        "One file with all layers and their styles, for GIS, if the input publish names geopackage.",
-        form="geopackage",
-        is_selectable=True,
-    ),
-    OutputKind(
-        "pmtiles",
-        PMTILES,
-        "models.pmtiles",
-        "Footprints as PMTiles",
-        "Vector tiles of the footprints in one file, for maps on the web, which read it in ranges; if the input "
-        "publish names pmtiles.",
-        form="pmtiles",
-        is_selectable=True,
-    ),
-    OutputKind(
-        "cityjson-zip",
-        ZIP,
-        "cityjson.zip",
-        "One CityJSON file per tile in a zip file",
-        "CityJSON 2.0 with all levels of detail, for programs that do not read sequences; if the input publish "
-        "names cityjson.",
-        form="cityjson",
-        is_selectable=True,
-    ),
-    OutputKind(
-        "stac",
-        JSON,
-        "stac.json",
-        "Catalogue of the tiles",
-        "A STAC 1.1 Collection, with an Item per tile below this output, if the input publish names stac. Their "
-        "assets are the files of the run.",
-        form="stac",
-    ),
-    OutputKind(
-        "solar",
-        GEOPARQUET,
-        "solar.parquet",
-        "Solar energy per roof plane as GeoParquet",
-        "One row per roof plane: sky view, horizon, and irradiation of a year under clear skies; if the input "
-        "publish names solar.",
-        form="solar",
-    ),
-    OutputKind(
-        "party-walls",
-        GEOPARQUET,
-        "party_walls.parquet",
-        "Party walls as GeoParquet",
-        "One row per pair of walls of two buildings that touch: the shared polygon and its area; if the input "
-        "publish names party-walls.",
-        form="party-walls",
-    ),
-    OutputKind(
-        "wall-areas",
-        GEOPARQUET,
-        "wall_areas.parquet",
-        "Wall areas per building as GeoParquet",
-        "One row per building: how much of its walls is shared, inner and exposed; with the party walls.",
-        form="party-walls",
+    *(
+        OutputKind(
+            one.output_id,
+            one.media_type,
+            one.filename,
+            one.title,
+            one.description,
+            form=form.name,
+            is_selectable=form.by_status and one.holds != "root",
+        )
+        for form in FORMS.values()
+        for one in form.outputs
     ),
 )
 """The outputs of a run by their ids, in the order of lists: those of the process `reconstruct`."""

@@ -6,7 +6,6 @@ files of the run. So relative paths in the files, such as those of a catalogue t
 
 from __future__ import annotations
 
-import json
 import re
 import shutil
 import zipfile
@@ -15,26 +14,20 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from service.outputs.files import write_json, write_moved_tileset, zip_files
+from pipeline.extras.publish.publishing import FORMS, Form
+from pipeline.registry import loaded
+from service.outputs.files import zip_files
 from service.outputs.kinds import FORMATS, OUTPUTS
 
 if TYPE_CHECKING:
     from pipeline.runtime.monitoring.progress import Listener
 
 _TILE = r"x-?\d{1,9}_y-?\d{1,9}"
-_SQUARE = rf"{_TILE}_\d{{1,9}}"
 FILES: Mapping[str, re.Pattern[str]] = MappingProxyType(
-    {
-        "3dtiles": re.compile(
-            rf"(tileset|terrain)\.json|(models|blocks|terrain)/{_TILE}\.glb|skylines/{_SQUARE}\.glb", re.ASCII
-        ),
-        "stac": re.compile(
-            rf"(points/)?collection\.json|(?P<tile>{_TILE})/(?P=tile)\.json|points/[\w-]+\.json", re.ASCII
-        ),
-    }
+    {name: re.compile(form.files, re.ASCII) for name, form in FORMS.items() if form.files}
 )
 """The paths of the files below an output that is a folder."""
-ROOTS: Mapping[str, str] = MappingProxyType({"3dtiles": "tileset.json", "stac": "collection.json"})
+ROOTS: Mapping[str, str] = MappingProxyType({name: FORMS[name].root for name in FILES})
 """The file to open first, by output."""
 RUN_FILE = re.compile(
     rf"(buildings|planes|rejected|decisions)/tile={_TILE}/part-0\.parquet|(cityjson|terrain)/tile={_TILE}/part-0\.city\.jsonl|"
@@ -86,6 +79,8 @@ def publish(
     """
     from pipeline.errors import RunCancelledError
 
+    # what is about the run as a whole names folders of the server
+    options = {"name": name, "geoid_height_m": geoid_height_m, "documents": ()}
     problems: dict[str, Exception] = {}
     out_dir.mkdir(parents=True, exist_ok=True)
     for done, form in enumerate(formats):
@@ -95,7 +90,7 @@ def publish(
 
         on_progress(done, len(formats))
         try:
-            _WRITERS[form](run_dir, out_dir, {"name": name, "geoid_height_m": geoid_height_m}, heard)
+            _write(FORMS[form], run_dir, out_dir, options, heard)
         except (RunCancelledError, MemoryError):
             raise
         except Exception as error:  # noqa: BLE001 - the caller reports it
@@ -107,80 +102,21 @@ def publish(
     return problems
 
 
-_Options = Mapping[str, Any]
-
-
-def _tiles(run_dir: Path, out_dir: Path, options: _Options, on_event: Listener) -> None:
-    from pipeline.extras.publish_3dtiles.publishing_3dtiles import publish_3dtiles
-
-    place = out_dir / "3dtiles"
-    publish_3dtiles(str(run_dir), str(place), geoid_height_m=options["geoid_height_m"], on_event=on_event)
-    _zip(place, out_dir / OUTPUTS["3dtiles-zip"].filename)
-    write_moved_tileset(place / ROOTS["3dtiles"], out_dir / OUTPUTS["3dtiles"].filename, "3dtiles")
-
-
-def _geopackage(run_dir: Path, out_dir: Path, _: _Options, on_event: Listener) -> None:
-    from pipeline.extras.publish.publishing import publish_geopackage
-
-    publish_geopackage(str(run_dir), str(out_dir / OUTPUTS["geopackage"].filename), on_event=on_event)
-
-
-def _pmtiles(run_dir: Path, out_dir: Path, _: _Options, on_event: Listener) -> None:
-    from pipeline.extras.publish.publishing import publish_pmtiles
-
-    publish_pmtiles(str(run_dir), str(out_dir / OUTPUTS["pmtiles"].filename), on_event=on_event)
-
-
-def _cityjson(run_dir: Path, out_dir: Path, _: _Options, on_event: Listener) -> None:
-    from pipeline.extras.publish.publishing import publish_cityjson
-
-    place = out_dir / "cityjson"
-    publish_cityjson(str(run_dir), str(place), on_event=on_event)
-    _zip(place, out_dir / OUTPUTS["cityjson-zip"].filename)
-    shutil.rmtree(place)
-
-
-def _stac(run_dir: Path, out_dir: Path, options: _Options, on_event: Listener) -> None:
-    from pipeline.extras.publish.publishing import publish_stac
-
-    place = out_dir / "stac"
-    # what is about the run as a whole names folders of the server
-    publish_stac(str(run_dir), str(place), name=options["name"], documents=(), on_event=on_event)
-    collection = json.loads((place / ROOTS["stac"]).read_bytes())
-    for link in collection["links"]:
-        if link["href"].startswith("./"):
-            link["href"] = f"stac/{link['href'].removeprefix('./')}"
-    write_json(out_dir / OUTPUTS["stac"].filename, collection)
-
-
-def _solar(run_dir: Path, out_dir: Path, _: _Options, on_event: Listener) -> None:
-    from pipeline.errors import RunError
-    from pipeline.extras.solar.solar_of_run import solar
-    from pipeline.runtime.manifest_reading import read_manifest
-
-    if not (read_manifest(str(run_dir)).crs or {}).get("wkt"):
-        raise RunError("the CRS of the tiles is unknown, so the sun's place is, too: submit again with --crs EPSG:n")
-    solar(str(run_dir), str(out_dir / OUTPUTS["solar"].filename), on_event=on_event)
-
-
-def _party_walls(run_dir: Path, out_dir: Path, _: _Options, on_event: Listener) -> None:
-    from pipeline.extras.party_walls.party_walls_of_run import party_walls
-
-    walls, areas = (str(out_dir / OUTPUTS[name].filename) for name in FORMATS["party-walls"])
-    party_walls(str(run_dir), walls, buildings=areas, on_event=on_event)
-
-
-_WRITERS: Mapping[str, Callable[[Path, Path, _Options, Listener], None]] = MappingProxyType(
-    {
-        "3dtiles": _tiles,
-        "geopackage": _geopackage,
-        "pmtiles": _pmtiles,
-        "cityjson": _cityjson,
-        "stac": _stac,
-        "solar": _solar,
-        "party-walls": _party_walls,
-    }
-)
+def _write(form: Form, run_dir: Path, out_dir: Path, options: Mapping[str, Any], on_event: Listener) -> None:
+    """Write a run in one format, and make its outputs of what was written."""
+    given = {name: options[name] for name in form.options}
+    given |= {name: str(out_dir / OUTPUTS[output_id].filename) for name, output_id in form.beside.items()}
+    first = form.outputs[0]
+    place = out_dir / (first.filename if first.holds == "file" else form.name)
+    form.write(str(run_dir), str(place), on_event=on_event, **given)
+    for output in form.outputs:
+        if output.holds == "zip":
+            _zip(place, out_dir / output.filename)
+        elif output.holds == "root":
+            content = loaded(form.moved)((place / form.root).read_bytes(), form.name)
+            (out_dir / output.filename).write_bytes(content)
+    if first.holds == "zip":
+        shutil.rmtree(place)
 
 
 def _zip(folder: Path, target: Path) -> None:

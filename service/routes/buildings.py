@@ -284,7 +284,7 @@ def points(
 
 @router.get(
     "/jobs/{jobID}/buildings/{buildingID}/decisions",
-    summary="What was tried for one building",
+    summary="Decisions about one building",
     response_class=Response,
     responses={
         200: document(Decisions, "The checks, forms and levels of detail, in their order.", _DECISIONS_EXAMPLE),

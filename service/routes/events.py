@@ -13,6 +13,7 @@ from fastapi.sse import KEEPALIVE_COMMENT, format_sse_event
 from starlette.concurrency import run_in_threadpool
 from starlette.types import Receive, Scope, Send
 
+from pipeline.backoff import Backoff, Pauses
 from service.errors import NoSuchJobError, TooManyRequestsError
 from service.jobs import JobEvent
 from service.routes.answers import document, problems, reference
@@ -163,7 +164,8 @@ async def follow(
 ) -> AsyncIterator[bytes]:
     """Events of a job as they come, until the job is over or removed, or the process ends."""
     yield format_sse_event(retry=RECONNECT_MS)
-    pause_s, quiet_s = poll_s, 0.0
+    looks = Pauses(Backoff(first_s=poll_s, longest_s=max(poll_s, LONGEST_LOOK_S), factor=1.5))
+    quiet_s = 0.0
     while not is_closing():
         found = await run_in_threadpool(store.events, job_id, after, PAGE)
         for event in found:
@@ -172,7 +174,8 @@ async def follow(
         if found and found[-1].status is not None and found[-1].status.is_over:
             return
         if found:
-            pause_s, quiet_s = poll_s, 0.0
+            looks.begin_anew()
+            quiet_s = 0.0
             continue
         if quiet_s >= KEEP_ALIVE_S:
             quiet_s = 0.0
@@ -183,9 +186,9 @@ async def follow(
             if job.status.is_over and not await run_in_threadpool(store.events, job_id, after, 1):
                 return
             yield KEEPALIVE_COMMENT
+        pause_s = looks.next_s()
         await anyio.sleep(pause_s)
         quiet_s += pause_s
-        pause_s = min(pause_s * 1.5, max(poll_s, LONGEST_LOOK_S))
 
 
 def _message(event: JobEvent) -> bytes:

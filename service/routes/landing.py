@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from fastapi import APIRouter, Depends, Request, Response
-from fastapi.responses import FileResponse, HTMLResponse
+from fastapi.responses import HTMLResponse
 
+from service.page_words import words_element
 from service.routes import collections
 from service.routes.answers import document, problems
 from service.routes.bound import Base, Settings_, visitor
@@ -80,11 +81,12 @@ def web_page(settings: ServiceSettings) -> Response:
     headers = {"Vary": "Accept", "Cache-Control": "no-cache"}
     if not page.is_file():
         return HTMLResponse(UNBUILT, headers=headers)
-    if settings.map_tiles is None:
-        return FileResponse(page, media_type="text/html", headers=headers)
-    # the page reads there what lies beneath its map
-    given = {"map-tiles": settings.map_tiles, "map-credit": settings.map_credit, "map-max-zoom": settings.map_max_zoom}
-    entries = "".join(f'<meta name="{name}" content="{escape(str(value))}">' for name, value in given.items())
+    entries = words_element()
+    if settings.map_tiles is not None:
+        # the page reads there what lies beneath its map
+        given = {"map-tiles": settings.map_tiles, "map-credit": settings.map_credit}
+        given["map-max-zoom"] = str(settings.map_max_zoom)
+        entries += "".join(f'<meta name="{name}" content="{escape(str(value))}">' for name, value in given.items())
     text = page.read_text(encoding="utf-8").replace("</head>", f"{entries}</head>", 1)
     return HTMLResponse(text, headers=headers)
 

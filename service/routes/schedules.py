@@ -235,8 +235,7 @@ async def run_schedule(
         return store.schedules.run_now(
             schedule_id,
             owner=submitting.caller.owner,
-            max_queued=settings.max_queued,
-            max_queued_per_key=settings.max_queued_per_key,
+            limits=settings.queue_limits,
             delivery=delivery,
         )
 
@@ -246,7 +245,7 @@ async def run_schedule(
 
 @router.get(
     "/schedules/{scheduleID}/runs",
-    summary="What happened to a schedule's slots",
+    summary="Outcomes of a schedule's times",
     responses={
         200: document(wire.ScheduleRunList, "Latest first.", {"runs": [SCHEDULE_RUN_EXAMPLE], "links": []}),
         **problems(400, 404),

@@ -165,8 +165,7 @@ class Submission:
                 request,
                 owner=self.caller.key_id,
                 priority=draft.priority,
-                max_queued=self.settings.max_queued,
-                max_queued_per_key=self.settings.max_queued_per_key,
+                limits=self.settings.queue_limits,
                 delivery=delivery,
             )
 

@@ -81,26 +81,20 @@ def move(
     if status.is_over:
         ends |= {"finished_at": now, "duration_ms": duration_ms(job_of(row), now), "dismiss_requested": False}
         after_commit(connection, partial(traces.job_ended, job_of(row), status))
-    progress = values.get("progress", row.progress)
     changed = {"status": status.value, "message": message, "updated_at": now, "last_event": row.last_event + 1}
-    connection.execute(sa.update(JOBS).where(JOBS.c.job_id == row.job_id).values(**changed, **ends, **values))
-    connection.execute(
-        sa.insert(EVENTS).values(
-            job_id=row.job_id,
-            sequence=row.last_event + 1,
-            at=now,
-            kind="status",
-            status=status.value,
-            stage=values.get("stage", row.stage),
-            done=0,
-            total=0,
-            progress=progress,
-            message=message,
-        )
-    )
-    line = NewLogLine(level=_level(row, status), message=f"{status.value}: {message}", stage="")
-    logs.append(connection, row, [line], now, attempt=values.get("attempt", row.attempt))
-    announce(connection, row, EVENT_OF[status], now)
+    one = JOBS.c.job_id == row.job_id
+    connection.execute(sa.update(JOBS).where(one).values(**changed, **ends, **values))
+    note_status(connection, connection.execute(sa.select(JOBS).where(one)).one(), now, _level(row, status))
+
+
+def note_status(connection: Connection, row: sa.Row[Any], now: dt.datetime, level: LogLevel = LogLevel.INFO) -> None:
+    """Write the status that a job has by now as an event, a line of its log, and news for webhooks."""
+    columns = ("job_id", "status", "stage", "progress", "message")
+    event = {"sequence": row.last_event, "at": now, "kind": "status", "done": 0, "total": 0}
+    connection.execute(sa.insert(EVENTS).values(**event, **{name: getattr(row, name) for name in columns}))
+    line = NewLogLine(level=level, message=f"{row.status}: {row.message}")
+    logs.append(connection, row, [line], now, attempt=row.attempt)
+    announce(connection, row, EVENT_OF[JobStatus(row.status)], now)
 
 
 def _level(row: sa.Row[Any], status: JobStatus) -> LogLevel:

@@ -16,14 +16,14 @@ from pipeline.errors import SettingsError
 from pipeline.schedule import Cron, Outcome, Rules, decided_by, enter, look, miss_passed
 from service.deliveries import Delivery
 from service.errors import ChangedMeanwhileError, TooManySchedulesError
-from service.jobs import Job
+from service.jobs import UNLIMITED, Job, QueueLimits
 from service.schedules import Definition, Schedule, ScheduleRun
 from service.store import queries, schedules, ticks
 from service.store.database import LOCK_SUBMISSIONS, StorePart, lock
 from service.store.records import storable
 from service.store.schedules import COLUMN_OF, last_runs, row_of, run_of, schedule_of
 from service.store.slot_book import SlotBook
-from service.store.submissions import QueueLimits, hold_uploads
+from service.store.submissions import hold_uploads
 from service.store.tables import SCHEDULE_RUNS, SCHEDULE_UPLOADS, SCHEDULES
 from service.store.uploads import creating
 
@@ -213,8 +213,7 @@ class ScheduleStore(StorePart):
         schedule_id: str,
         *,
         owner: str | None = None,
-        max_queued: int,
-        max_queued_per_key: int,
+        limits: QueueLimits = UNLIMITED,
         delivery: Delivery[Job] | None = None,
     ) -> Job:
         """Make a job now, independent of the clock, also if the schedule is paused.
@@ -228,7 +227,6 @@ class ScheduleStore(StorePart):
         QueueFullError
             Too many jobs wait.
         """
-        limits = QueueLimits(max_queued=max_queued, max_queued_per_key=max_queued_per_key)
         with creating(self._database, delivery) as (connection, made):
             now = self._database.now(connection)
             job_id = ticks.run_by_hand(connection, schedule_id, owner, now=now, limits=limits)
@@ -246,17 +244,15 @@ class ScheduleStore(StorePart):
 
     # --- for drivers
 
-    def tick(
-        self, *, max_queued: int, max_queued_per_key: int, now: dt.datetime | None = None
-    ) -> builtins.list[ScheduleRun]:
+    def tick(self, *, limits: QueueLimits = UNLIMITED, now: dt.datetime | None = None) -> builtins.list[ScheduleRun]:
         """Decide every slot that has passed. Any number of drivers may do so at once.
 
         Each schedule is a transaction of its own, in which its slots are decided and its job is made.
 
         Parameters
         ----------
-        max_queued, max_queued_per_key : int
-            Maximum number of waiting jobs, in total and per key.
+        limits : QueueLimits
+            How many jobs may wait.
         now : datetime, optional
             The present; by default the database's clock.
 
@@ -270,7 +266,6 @@ class ScheduleStore(StorePart):
             at = self._database.now(connection) if now is None else now
             if not ticks.something_is_due(connection, at):
                 return []
-        limits = QueueLimits(max_queued=max_queued, max_queued_per_key=max_queued_per_key)
         added: list[ScheduleRun] = []
         for _ in range(MAX_PER_TICK):
             with self._database.write() as connection:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import datetime as dt
 import uuid
 from collections.abc import Sequence
@@ -13,29 +12,16 @@ from sqlalchemy.engine import Connection
 from pipeline.runtime.monitoring import tracing
 from service.deliveries import Delivery
 from service.errors import NoSuchUploadError, QueueFullError, ResultNotReadyError
-from service.jobs import Job, JobRequest, JobStatus, NewLogLine
-from service.store import logs
-from service.store.changes import lock_job, move
+from service.jobs import UNLIMITED, Job, JobRequest, JobStatus, QueueLimits
+from service.store.changes import lock_job, move, note_status
 from service.store.database import LOCK_SUBMISSIONS, lock
-from service.store.outbox import announce
 from service.store.policies import lease_expired
 from service.store.queries import JobQueries, get, no_such_job, seen_by
 from service.store.records import job_of, storable
 from service.store.tables import EVENTS, JOB_UPLOADS, JOBS, LOG_LINES, UPLOADS
 from service.store.uploads import creating
-from service.webhooks import EventType
 
 _WATCH_WAIT_S = 0.2
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class QueueLimits:
-    """How many jobs may wait."""
-
-    max_queued: int
-    """All jobs."""
-    max_queued_per_key: int
-    """Jobs of one key."""
 
 
 class JobSubmissions(JobQueries):
@@ -47,8 +33,7 @@ class JobSubmissions(JobQueries):
         *,
         owner: str | None,
         priority: int = 0,
-        max_queued: int,
-        max_queued_per_key: int,
+        limits: QueueLimits = UNLIMITED,
         delivery: Delivery[Job] | None = None,
     ) -> Job:
         """Submit a job; its row is committed when this returns.
@@ -61,8 +46,8 @@ class JobSubmissions(JobQueries):
             The key that submits; None if keys are not used, then only the whole queue is limited.
         priority : int
             Higher runs first.
-        max_queued, max_queued_per_key : int
-            Maximum number of waiting jobs, in total and of this key; running jobs do not count.
+        limits : QueueLimits
+            How many jobs may wait.
         delivery : Delivery, optional
             What is written with the job: uploads, and the answer under the request's key.
 
@@ -78,7 +63,6 @@ class JobSubmissions(JobQueries):
             The request names an upload that is gone.
         """
         with creating(self._database, delivery) as (connection, made):
-            limits = QueueLimits(max_queued=max_queued, max_queued_per_key=max_queued_per_key)
             check_queue(connection, owner, limits)
             now = self._database.now(connection)
             job_id = insert(connection, request, owner=owner, priority=priority, now=now)
@@ -212,27 +196,11 @@ def insert(
             traceparent=None if (submitted := tracing.current()) is None else submitted.traceparent,
         )
     )
-    connection.execute(
-        sa.insert(EVENTS).values(
-            job_id=job_id,
-            sequence=1,
-            at=now,
-            kind="status",
-            status=JobStatus.ACCEPTED.value,
-            stage="",
-            done=0,
-            total=0,
-            progress=0,
-            message="waits for a driver",
-        )
-    )
     needed = request.upload_ids
     hold_uploads(connection, needed)
     if needed:
         connection.execute(sa.insert(JOB_UPLOADS), [{"job_id": job_id, "upload_id": name} for name in needed])
-    made = connection.execute(sa.select(JOBS).where(JOBS.c.job_id == job_id)).one()
-    logs.append(connection, made, [NewLogLine(message="accepted: waits for a driver")], now, attempt=0)
-    announce(connection, made, EventType.ACCEPTED, now)
+    note_status(connection, connection.execute(sa.select(JOBS).where(JOBS.c.job_id == job_id)).one(), now)
     return job_id
 
 

@@ -14,11 +14,12 @@ from sqlalchemy.engine import Connection
 from pipeline.errors import SettingsError
 from pipeline.schedule import PUT_BACK, Entry, Outcome, ScheduleState, decided_by, enter, look
 from service.errors import ForbiddenError, ScheduleBusyError, ServiceError
+from service.jobs import QueueLimits
 from service.schedules import Schedule, ScheduleRun, Trigger
 from service.store import schedules
 from service.store.records import key_of
 from service.store.slot_book import SlotBook
-from service.store.submissions import QueueLimits, check_queue, insert
+from service.store.submissions import check_queue, insert
 from service.store.tables import KEYS, SCHEDULES
 
 BROKEN_PAUSE = dt.timedelta(hours=1)

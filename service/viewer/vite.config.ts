@@ -2,7 +2,18 @@ import { defineConfig } from "vite";
 
 const SERVICE = "http://127.0.0.1:8000"; // the address of `gablework serve`; only for `npm run dev`
 
+/** The words that the service puts into the page (`src/words/tables.ts`); a build leaves them to the service. */
+const words = {
+  name: "words",
+  apply: "serve" as const,
+  transformIndexHtml: async (html: string): Promise<string> => {
+    const page = await (await fetch(`${SERVICE}/?f=html`)).text();
+    return html.replace("</head>", `${/<script type="application\/json" id="words">.*?<\/script>/.exec(page)?.[0] ?? ""}</head>`);
+  },
+};
+
 export default defineConfig(({ command }) => ({
+  plugins: [words],
   base: command === "build" ? "/viewer/" : "/",
   build: {
     target: "es2022",

@@ -10,15 +10,14 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import BeforeValidator, Field, PlainValidator, ValidationError, WithJsonSchema, WrapValidator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
+from pipeline.io.formats import ASCII, FORMATS, LAS
 from service.drafts import Inline, reference_of
 from service.errors import MOST_FAULTS
 from service.jobs import InputReference
 from service.wire.base import OneOf, Request, raised_again
 from service.wire.faults import FURTHER, json_bytes
 
-LAS, LAZ, PLY, TEXT, CSV = "application/vnd.las", "application/vnd.laszip", "application/ply", "text/plain", "text/csv"
-
-ENDINGS: Mapping[str, str] = {LAZ: ".laz", LAS: ".las", PLY: ".ply", TEXT: ".xyz", CSV: ".csv"}
+ENDINGS: Mapping[str, str] = {media: suffix for form in FORMATS for suffix, media in form.media_types.items() if media}
 """Media types of point clouds sent by value, and the endings of their files."""
 
 _OUTLINE_ENDINGS = {
@@ -108,10 +107,10 @@ def _points(content: bytes, media_type: str | None) -> Inline:
 
 def _ending_of(content: bytes) -> str:
     """Ending of a point cloud's file, by its first bytes."""
-    if content.startswith(b"LASF"):
-        # the highest bit of the point format marks compression
-        return ".laz" if len(content) > 104 and content[104] & 0x80 else ".las"
-    return ".ply" if content.startswith(b"ply") else ".xyz"
+    form = next((form for form in FORMATS if content.startswith(form.magic)), ASCII)
+    # the highest bit of the point format marks compression
+    is_laz = form is LAS and len(content) > 104 and content[104] & 0x80
+    return ".laz" if is_laz else form.suffixes[0]
 
 
 def outlines(given: Any) -> Source:

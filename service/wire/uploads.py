@@ -6,7 +6,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_serializer
 
-from service.wire.base import Answer, Link, ZonedTime
+from pipeline.io.formats import FORMATS
+from service.wire.base import Answer, Link, OneOf, ZonedTime
 
 
 class Crs(Answer):
@@ -46,20 +47,12 @@ class Preflight(BaseModel):
     model_config = ConfigDict(json_schema_extra=_nullable, extra="allow")
 
     kind: Literal["points", "footprints", "guides"]
-    format: Literal[
-        "las",
-        "laz",
-        "copc",
-        "ply",
-        "ascii",
-        "geopackage",
-        "geojson",
-        "geoparquet",
-        "flatgeobuf",
-        "gml",
-        "kml",
-        "shapefile",
-        "zip",
+    format: Annotated[
+        str,
+        OneOf(
+            *(name for form in FORMATS for name in form.encodings),
+            *("geopackage", "geojson", "geoparquet", "flatgeobuf", "gml", "kml", "shapefile", "zip"),
+        ),
     ]
     usable: bool = Field(description="Whether a job can use it without further inputs.")
     problems: list[str] = Field(description="Problems that a job can fix, such as degrees with `crs`.")

@@ -16,8 +16,9 @@ from pipeline.export.records import SCHEMAS
 from pipeline.extras.overrides.overrides_file import overrides_of
 from pipeline.extras.papers.settings import FuzzySartSettings
 from pipeline.io import SpatialReference
-from pipeline.model import REASONS, Reason, RoofType, Status
+from pipeline.model import Reason, RoofType, Status
 from pipeline.parameters import Parameters
+from pipeline.reasons import REASONS
 from pipeline.roof.settings import RoofSettings, RoofTypeSettings
 from pipeline.ruler.epochs.settings import DiffSettings, read_settings
 from pipeline.settings import RunSettings
@@ -49,6 +50,7 @@ GENERATED = (
     "measures.md",
     "changes.md",
     "columns.md",
+    "reasons.md",
     "solar.md",
     "party_walls.md",
 )
@@ -58,6 +60,10 @@ GENERATED = (
 def test_a_generated_page_is_what_the_code_says(generator: ModuleType, page: str) -> None:
     assert tuple(generator.PAGES) == GENERATED
     assert (DOCS / "reference" / page).read_text() == generator.PAGES[page](), "run make docs"
+
+
+def test_the_words_for_the_tests_of_the_page_are_those_of_the_service(generator: ModuleType) -> None:
+    assert generator.VIEWER_WORDS.read_text() == generator.viewer_words(), "run make docs"
 
 
 def test_every_option_is_in_the_reference(generator: ModuleType) -> None:
@@ -85,7 +91,7 @@ def test_the_reference_says_defaults_that_are_words_and_all_values_of_numbers_th
     workers = {line.split(" | ")[1] for line in lines if line.startswith("| `--workers` N\\|auto | ")}
     # commands of the pipeline have a default of their own, those of the service take what the environment says
     assert workers == {"`auto`", ""}
-    assert '| `workers` | `"auto"` |  | `auto`, or 0 to 1024 |' in (DOCS / "reference" / "batch_file.md").read_text()
+    assert '| `workers` | `"auto"` | `auto`, or 0 to 1024 |' in (DOCS / "reference" / "batch_file.md").read_text()
 
 
 def test_every_setting_of_every_stage_is_in_the_reference(generator: ModuleType) -> None:
@@ -159,11 +165,9 @@ def test_the_overrides_files_of_the_docs_are_valid() -> None:
 
 
 def test_every_reason_status_and_roof_type_is_reported() -> None:
+    reasons = re.findall(r"^\| `(\w+)` \|", (DOCS / "reference" / "reasons.md").read_text(), re.MULTILINE)
+    assert set(reasons) == {reason.value for reason in Reason} == {reason.value for reason in REASONS}
     text = (DOCS / "reference" / "records.md").read_text()
-    reasons = text.split("## Reasons")[1]
-    assert re.findall(r"^\| `(\w+)` \|", reasons, re.MULTILINE) == [reason.value for reason in Reason]
-    reported = re.findall(r"^\| `\w+` \| [\w, ]+ \| (.*) \|$", reasons, re.MULTILINE)
-    assert [re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", text) for text in reported] == [REASONS[reason] for reason in Reason]
     status = text.split("## Status")[1].split("## Support")[0]
     assert re.findall(r"^\| `(\w+)` \|", status, re.MULTILINE) == [entry.value for entry in Status]
     meaning = next(column.meaning for column in COLUMNS["buildings"] if column.name == "roof_type")

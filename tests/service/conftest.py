@@ -42,7 +42,7 @@ class LocalService:
     def waiting(self, owner: str | None = None, **request: Any) -> Job:
         """A job in the line."""
         asked = JobRequest(tiles=(InputReference(kind="path", value="/srv/tile.laz"),), **request)
-        return self.store.create(asked, owner=owner, max_queued=1000, max_queued_per_key=1000)
+        return self.store.create(asked, owner=owner)
 
     def running(self, owner: str | None = None) -> Job:
         """A job that a driver holds."""

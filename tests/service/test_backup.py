@@ -12,6 +12,7 @@ import pytest
 from command_line import app
 from copy_contract import every_row
 from live_service import POINTS
+from migrated import add_old_job, at_revision
 from store_contract import claim
 from typer.testing import CliRunner
 
@@ -46,7 +47,7 @@ class Site:
     def waiting(self, upload: Upload | None = None) -> Job:
         kind, value = ("path", "/srv/a.laz") if upload is None else ("upload", upload.upload_id)
         asked = JobRequest(tiles=(InputReference(kind=kind, value=value),))
-        return self.store.create(asked, owner=None, max_queued=1000, max_queued_per_key=1000)
+        return self.store.create(asked, owner=None)
 
     def finished(self, content: str = "models") -> Job:
         self.waiting()
@@ -146,12 +147,11 @@ def test_results_that_differ_from_those_of_an_earlier_backup_replace_them(site: 
 def test_a_database_of_an_earlier_version_is_saved_as_it_is_and_migrated_when_it_is_restored(
     site: Site, tmp_path: Path
 ) -> None:
-    from alembic import command
-    from schedule_store_contract import migrate
-
-    job = site.finished()
-    with site.store._database.write() as connection:
-        migrate(connection, command.downgrade, "0003")
+    site.store.close()
+    for left in site.folder.root.glob("service.db*"):
+        left.unlink()
+    with JobStore(site.url) as store, at_revision(store, "0003") as connection:
+        job_id = add_old_job(connection, JobRequest(tiles=()), status="successful")
     site.back_up()
     with sqlite3.connect(site.target / "service.db") as connection:
         assert connection.execute("SELECT version_num FROM alembic_version").fetchone() == ("0003",)
@@ -160,7 +160,7 @@ def test_a_database_of_an_earlier_version_is_saved_as_it_is_and_migrated_when_it
     restore(site.target, folder, url)
     with JobStore(url) as store:
         store.check()
-        assert store.get(job.job_id).status is JobStatus.SUCCESSFUL
+        assert store.get(job_id).status is JobStatus.SUCCESSFUL
 
 
 def test_places_that_cannot_hold_a_backup_are_refused(site: Site, tmp_path: Path) -> None:

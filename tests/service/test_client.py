@@ -191,14 +191,6 @@ def test_a_submission_whose_answer_is_lost_makes_one_job(site: Site, beside: Thr
     assert sum(site.store.counts().values()) == 1
 
 
-def test_all_faults_of_a_submission_are_named(site: Site) -> None:
-    path = site.file("points.xyz", POINTS)
-    with pytest.raises(api.RefusedError) as caught:
-        site.client().submit(path, crs="EPSG:4326", method="magic", colour="red")
-    assert caught.value.status == 400
-    assert all(word in str(caught.value) for word in ("EPSG:28992", "magic", "colour"))
-
-
 def test_other_processes_take_their_own_inputs(site: Site) -> None:
     path, client = site.file("points.xyz", POINTS), site.client()
     compared = client.submit(path, process="compare", crs="EPSG:28992", methods=["kmeans", "fuzzy-sart"])
@@ -385,18 +377,6 @@ def test_results_that_are_not_there_are_explained(site: Site) -> None:
 
 
 # --- jobs
-
-
-def test_jobs_are_listed_in_pages_and_by_status(site: Site) -> None:
-    ids = [site.echoed(title=f"number {number}").job_id for number in range(5)]
-    done = site.claimed()
-    site.store.succeed(done, message="done", summary={})
-    client = site.client()
-    assert [job.id for job in client.jobs()] == ids[::-1]
-    assert [job.id for job in client.jobs(limit=2, offset=1)] == [ids[3], ids[2]]
-    assert [job.id for job in client.jobs(status="successful")] == [done.job_id]
-    assert len(client.jobs(status=["accepted", "running"], process="echo")) == 4
-    assert client.jobs(process="reconstruct") == []
 
 
 def test_cancel_never_removes_what_is_over(site: Site) -> None:

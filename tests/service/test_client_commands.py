@@ -15,7 +15,6 @@ from live_service import POINTS
 from typer.testing import CliRunner
 
 from service.jobs import Fault, JobFailure
-from service.keys import Scope
 from service.problems import FAILURES
 
 
@@ -207,20 +206,6 @@ def test_commands_that_cannot_work_say_why(site: Site, words: list[str], code: i
     assert "Traceback" not in found.stderr
     as_json = invoke(*(str(files.get(word, word)) for word in words), "--json")
     assert json.loads(as_json.stdout)["error"]["exit_code"] == code
-
-
-def test_keys_come_from_options_files_and_the_environment(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
-    key = site.key(Scope.SUBMIT)
-    refused = invoke("jobs")
-    assert (refused.exit_code, "GABLEWORK_KEY" in refused.stderr) == (6, True)
-    file = site.file("key.txt", f"{key}\n".encode())
-    done("jobs", "--key-file", str(file))
-    done("jobs", "--key", key)
-    monkeypatch.setenv("GABLEWORK_KEY_FILE", str(file))
-    done("jobs")
-    monkeypatch.setenv("GABLEWORK_KEY", "gw_" + "A" * 43)
-    wrong = invoke("jobs")
-    assert (wrong.exit_code, "A" * 43 in wrong.output) == (6, False)
 
 
 def test_commands_import_the_client_and_nothing_of_the_engine(site: Site, tmp_path: Path) -> None:

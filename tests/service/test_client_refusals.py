@@ -130,12 +130,6 @@ def test_an_answer_of_something_else_is_recognised(
     assert said in str(caught.value)
 
 
-def test_a_page_in_place_of_a_job_is_recognised_when_one_is_submitted(scripted: Callable[..., Scripted]) -> None:
-    client = scripted((200, {"Content-Type": "text/html"}, b"<h1>hello</h1>")).client()
-    with pytest.raises(api.ForeignAnswerError, match="200 \\(text/html\\)"):
-        client.submit("https://data.example.org/tile.laz")
-
-
 def test_a_message_that_is_no_event_is_recognised(scripted: Callable[..., Scripted]) -> None:
     stream = (200, {"Content-Type": "text/event-stream"}, b'id: 1\ndata: {"hello": 1}\n\n')
     with pytest.raises(api.ForeignAnswerError, match="something else than events"):
@@ -187,17 +181,6 @@ def test_keys_and_scopes_that_are_missing_are_explained(site: Site) -> None:
     with pytest.raises(api.ForbiddenError, match="scope submit"):
         site.client(key=reader).submit(site.file("points.xyz", POINTS))
     assert site.client(key=reader).jobs() == []
-
-
-def test_limits_of_a_service_are_explained(site: Site) -> None:
-    site.restart(max_upload_bytes=1000)
-    with pytest.raises(api.RefusedError, match="GABLEWORK_MAX_UPLOAD_BYTES") as caught:
-        site.client().upload(site.file())
-    assert caught.value.status == 413
-    site.restart(max_upload_bytes=10**9, max_upload_bytes_per_key=1000)
-    with pytest.raises(api.RefusedError) as caught:
-        site.client().upload(site.file())
-    assert (caught.value.status, caught.value.problem.kind) == (507, "quota-exceeded")
 
 
 def test_a_certificate_must_be_trusted(scripted: Callable[..., Scripted], tmp_path: Path) -> None:

@@ -1,6 +1,5 @@
 """Jobs as records, and what is decided about them: no database, no clock."""
 
-import dataclasses
 import datetime as dt
 import errno
 import json
@@ -24,7 +23,7 @@ from service.errors import InputRefusedError, NoSpaceError, NoSuchUploadError, R
 from service.jobs import Fault, InputReference, Job, JobRequest, JobStatus
 from service.settings import ServiceSettings
 from service.store.changes import MAX_KEPT
-from service.store.policies import after_loss, duration_ms, lease_expired, loss
+from service.store.policies import duration_ms, lease_expired, loss
 
 NOON = dt.datetime(2026, 5, 1, 12, tzinfo=dt.UTC)
 
@@ -36,10 +35,6 @@ def job(**values: Any) -> Job:
 
 
 # --- records
-
-
-def test_a_job_is_over_in_three_of_five_statuses() -> None:
-    assert [status for status in JobStatus if status.is_over] == ["successful", "failed", "dismissed"]
 
 
 references = st.builds(InputReference, kind=st.sampled_from(["upload", "path", "url"]), value=st.text(max_size=20))
@@ -78,24 +73,6 @@ def test_only_a_running_job_has_a_lease(status: JobStatus) -> None:
     assert not lease_expired(job(status=status, lease_until=NOON), NOON + dt.timedelta(days=1))
 
 
-@pytest.mark.parametrize(
-    ("lost_before", "max_attempts", "expected"),
-    [
-        (0, 1, JobStatus.FAILED),
-        (0, 2, JobStatus.ACCEPTED),
-        (1, 2, JobStatus.FAILED),
-        (1, 3, JobStatus.ACCEPTED),
-        (7, 3, JobStatus.FAILED),
-    ],
-)
-def test_a_lost_job_waits_again_until_it_was_lost_too_often(
-    lost_before: int, max_attempts: int, expected: JobStatus
-) -> None:
-    lost = job(lost_attempts=lost_before)
-    assert after_loss(lost, max_attempts) is expected
-    assert after_loss(dataclasses.replace(lost, dismiss_requested=True), max_attempts) is JobStatus.DISMISSED
-
-
 def test_a_loss_names_the_number_the_stage_and_the_fix() -> None:
     reported = loss(job(lost_attempts=2, stage="split"))
     assert reported.fault is Fault.LOST
@@ -124,7 +101,7 @@ def test_progress_grows_with_the_stages_and_within_them(steps: list[tuple[str, i
 
 def test_the_stages_make_up_the_whole_job() -> None:
     # what a comparison does besides is short: progress stands still meanwhile; kernels are compiled once
-    others = {"compile", "records", "points", "pictures", "page"}
+    others = {"compile", "redraw", "records", "points", "pictures", "page"}
     assert set(WORDS) - set(WEIGHTS) - set(CLASSIFY_WEIGHTS) == others
     assert [percent("compile", done, 100) for done in (0, 50, 100)] == [0, COMPILING // 2, COMPILING]
     for weights in (WEIGHTS, CLASSIFY_WEIGHTS):

@@ -1,13 +1,21 @@
 """The landing page, conformance, health and figures."""
 
 import html
+import json
+import re
 from pathlib import Path
 
 import pytest
 
 from pipeline import __version__
+from pipeline.export.columns import BUILDINGS
+from pipeline.io.formats import POINT_SUFFIXES
+from pipeline.model import Reason
+from pipeline.runtime.monitoring.stages import STAGES
 from service.errors import StartUpError
+from service.filenames import FOOTPRINT_SUFFIXES
 from service.keys import Scope
+from service.page_words import page_words
 from service.routes import landing
 from service.routes.collections import CONFORMANCE as FEATURES
 from service.settings import ServiceSettings
@@ -38,6 +46,29 @@ def test_the_parameter_f_stands_above_the_header(local_service) -> None:
     assert local_service.client.get("/?f=html").headers["content-type"].startswith("text/html")
     assert local_service.client.get("/?f=xml").status_code == 400
     assert local_service.client.get("/", headers={"Accept": "image/png"}).status_code == 406
+
+
+def test_the_page_has_the_words_of_the_engine(starting, monkeypatch, tmp_path: Path) -> None:
+    (tmp_path / "index.html").write_text("<!doctype html><head><title>the page</title></head>")
+    monkeypatch.setattr(landing, "VIEWER", tmp_path)
+    text = starting().client.get("/?f=html").text
+    (found,) = re.findall(r'<script type="application/json" id="words">(.*)</script></head>', text)
+    words = json.loads(found)
+    assert words == json.loads(json.dumps(page_words()))
+    assert set(words["reasons"]) == {reason.value for reason in Reason}
+    assert [stage["name"] for stage in words["stages"]] == [stage.name for stage in STAGES]
+    assert set(words["columns"]) <= {column.name for column in BUILDINGS}
+    assert words["columns"]["coverage"]["unit"] == "%"
+    assert words["columns"]["ridge_z"] == {
+        "label": "Ridge",
+        "unit": "m",
+        "digits": 2,
+        "section": "Height",
+        "isElevation": True,
+    }
+    assert words["inputs"]["verticalUnit"] == "Vertical unit"
+    assert words["endings"]["tiles"].split(",") == [*POINT_SUFFIXES]
+    assert words["endings"]["vectors"].split(",") == [*FOOTPRINT_SUFFIXES]
 
 
 def test_tiles_beneath_the_map_are_named_in_the_page_and_allowed_in_its_policy_alone(

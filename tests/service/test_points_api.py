@@ -10,9 +10,10 @@ from urllib.parse import urljoin
 import finished_runs as runs
 import numpy as np
 import pytest
+from points_glb import read_points_glb
 from starlette.testclient import TestClient
 
-from pipeline.extras.octree.point_glb import NO_BUILDING, read_points_glb
+from pipeline.extras.octree.point_glb import NO_BUILDING
 from service.keys import Scope, new_key
 
 GABLE = runs.ident("gable")

@@ -19,6 +19,7 @@ from starlette.testclient import TestClient
 from pipeline.errors import RunCancelledError
 from pipeline.export.glb_container import read_document
 from pipeline.extras.party_walls.party_walls_of_run import party_walls
+from pipeline.extras.publish.publishing import Form
 from pipeline.runtime.manifest import RunStatus
 from service.keys import Scope, new_key
 from service.outputs import published
@@ -215,14 +216,15 @@ def test_an_unexpected_fault_leaves_out_that_format_whole(
     form: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     runs.write_run(tmp_path / "run")
-    plain = dict(published._WRITERS)
+    plain = published._write
 
-    def broken(*given: Any) -> None:
-        plain[form](*given)
-        (tmp_path / "out" / form).mkdir(exist_ok=True)
-        raise IndexError("list index out of range")
+    def broken(one: Form, *given: Any) -> None:
+        plain(one, *given)
+        if one.name == form:
+            (tmp_path / "out" / form).mkdir(exist_ok=True)
+            raise IndexError("list index out of range")
 
-    monkeypatch.setattr(published, "_WRITERS", plain | {form: broken})
+    monkeypatch.setattr(published, "_write", broken)
     found = published.publish(tmp_path / "run", tmp_path / "out", WITHOUT_SOLAR, name="some run")
     assert {name: type(error) for name, error in found.items()} == {form: IndexError}
     files = {path.name for path in (tmp_path / "out").iterdir()}
@@ -239,7 +241,7 @@ def test_a_format_without_memory_ends_the_work(tmp_path: Path, monkeypatch: pyte
     def broken(*_: Any) -> None:
         raise MemoryError
 
-    monkeypatch.setattr(published, "_WRITERS", {"pmtiles": broken})
+    monkeypatch.setattr(published, "_write", broken)
     with pytest.raises(MemoryError):
         published.publish(tmp_path / "run", tmp_path / "out", ("pmtiles",), name="a")
 

@@ -15,7 +15,7 @@ from starlette.testclient import TestClient
 
 from service.jobs import Fault, JobFailure
 from service.keys import Scope, new_key
-from service.outputs import CLASSIFICATION_OUTPUTS, COMPARISON_OUTPUTS, KINDS, OUTPUTS
+from service.outputs import KINDS, OUTPUTS
 from service.outputs.kinds import ON_REQUEST
 
 OGC = "http://www.opengis.net/def/exceptions/ogcapi-processes-1/1.0/"
@@ -281,15 +281,3 @@ def test_the_openapi_document_declares_every_answer_with_its_type(client: TestCl
     assert all(set(file[status]["content"]) == {"application/problem+json"} for status in ("404", "406", "416"))
     listed = described["/jobs/{jobID}/results"]["get"]["responses"]["200"]["content"]["application/json"]
     assert json.dumps(listed["example"])
-
-
-def test_the_page_on_results_says_every_output_with_its_type_and_file() -> None:
-    page = Path(__file__).resolve().parents[2] / "docs/how_to/results_by_rest.md"
-    rows = [line.split("|")[1:4] for line in page.read_text().splitlines() if line.startswith("| `")]
-    reported = [tuple(cell.strip().strip("`") for cell in row) for row in rows]
-    of_a_run = [(kind.output_id, kind.media_type, kind.filename) for kind in OUTPUTS.values()]
-    of_a_comparison = [(kind.output_id, kind.media_type, kind.filename) for kind in COMPARISON_OUTPUTS.values()]
-    classified = [(kind.output_id, kind.media_type, kind.filename) for kind in CLASSIFICATION_OUTPUTS.values()]
-    assert reported[: len(of_a_run)] == of_a_run
-    assert [row for row in reported if row in classified] == classified
-    assert [row for row in reported if row in of_a_comparison] == of_a_comparison

@@ -51,7 +51,7 @@ def test_two_drivers_make_one_job_of_each_slot(bench: Bench) -> None:
 def test_a_slot_that_waits_is_run_when_the_drivers_job_is_over(bench: Bench) -> None:
     schedule = due(bench, overlap=Overlap.WAIT)
     bench.script.waits()
-    job = bench.store.schedules.run_now(schedule.schedule_id, max_queued=10, max_queued_per_key=10)
+    job = bench.store.schedules.run_now(schedule.schedule_id)
     bench.driver()
     bench.becomes(job, JobStatus.RUNNING)
 

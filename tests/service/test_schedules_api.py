@@ -14,10 +14,9 @@ from service.driver.janitor import tidy_uploads
 from service.files import StateFolder
 from service.jobs import JobStatus
 from service.keys import Scope
-from service.store.tables import SCHEDULES, UPLOADS
+from service.store.tables import UPLOADS
 
 HOUR = dt.timedelta(hours=1)
-LIMITS = {"max_queued": 1000, "max_queued_per_key": 1000}
 
 
 def body(upload: str, **values: Any) -> dict[str, Any]:
@@ -308,19 +307,12 @@ def test_a_run_by_hand_names_the_job_that_is_under_way(local_service) -> None:
     assert local_service.client.post(f"{place}/run").status_code == 201
 
 
-def test_a_run_by_hand_waits_in_line_like_any_job(starting) -> None:
-    service = starting(max_queued=1)
-    made = make(service)
-    service.waiting()
-    assert service.client.post(f"/schedules/{made['scheduleID']}/run").status_code == 429
-
-
 def test_the_history_of_the_slots_is_shown(local_service) -> None:
     made = make(local_service, cron="0 * * * *", timeZone="UTC")
     store = local_service.store
     start = store.schedules.get(made["scheduleID"]).next_at
-    store.schedules.tick(now=start + 5 * HOUR, **LIMITS)
-    store.schedules.tick(now=start + 6 * HOUR, **LIMITS)
+    store.schedules.tick(now=start + 5 * HOUR)
+    store.schedules.tick(now=start + 6 * HOUR)
     answer = local_service.client.get(f"/schedules/{made['scheduleID']}/runs")
     skipped, submitted, missed = answer.json()["runs"]
     assert [one["outcome"] for one in (skipped, submitted, missed)] == ["skipped", "submitted", "missed"]
@@ -388,24 +380,3 @@ def test_who_may_read_may_not_write_and_no_key_sees_the_schedules_of_others(loca
     job = client.post(f"{place}/run", headers=admin).json()["jobID"]
     assert client.get(f"/jobs/{job}", headers=mine).status_code == 200
     assert client.delete(place, headers=mine).status_code == 204
-
-
-def test_a_priority_above_the_others_needs_an_administrator(local_service) -> None:
-    mine, admin = local_service.key(Scope.SUBMIT), local_service.key(Scope.ADMIN)
-    for who, expected in ((mine, 403), (admin, 201)):
-        asked = body(local_service.upload(**who))
-        asked["execute"]["inputs"]["priority"] = 5
-        assert local_service.client.post("/schedules", json=asked, headers=who).status_code == expected
-
-
-def test_the_landing_page_leads_to_the_schedules(local_service) -> None:
-    links = local_service.client.get("/?f=json").json()["links"]
-    (found,) = [link["href"] for link in links if link["rel"] == "schedules"]
-    assert local_service.client.get(found).json()["schedules"] == []
-
-
-def test_the_next_time_is_stored_as_it_is_shown(local_service) -> None:
-    made = make(local_service)
-    with local_service.store._database.read() as connection:
-        (row,) = connection.execute(sa.select(SCHEDULES)).all()
-    assert row.next_at == dt.datetime.fromisoformat(made["nextTimes"][0])

@@ -19,8 +19,9 @@ from processes import wait_for
 from starlette.testclient import TestClient
 from typer.testing import CliRunner
 
-from pipeline.extras.publish import publishing, selection
-from pipeline.extras.publish.publishing import disk_at
+from pipeline.extras.publish import selection
+from pipeline.extras.publish.finished_run import disk_at
+from pipeline.extras.publish_gis import geopackage
 from pipeline.model import Doubt, Reason, Status
 from service.errors import SelectionBusyError
 from service.outputs import selected
@@ -169,7 +170,7 @@ def test_a_full_disk_is_said_before_anything_is_written(service: runs.Service, m
     assert not (service.folder.outputs(job_id, 1) / "selected").exists()
 
 
-@pytest.mark.parametrize("fails", ["select_run", "publish_geopackage"])
+@pytest.mark.parametrize("fails", ["select_run", "file_outside"])
 def test_a_disk_that_fills_up_meanwhile_is_said_and_no_output_stays_missing(
     service: runs.Service, monkeypatch: pytest.MonkeyPatch, fails: str
 ) -> None:
@@ -185,11 +186,7 @@ def test_a_disk_that_fills_up_meanwhile_is_said_and_no_output_stays_missing(
             raise OSError(errno.ENOSPC, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr(
-            selection if fails == "select_run" else publishing,
-            fails,
-            full,
-        )
+        patch.setattr(selection if fails == "select_run" else geopackage, fails, full)
         code = selected.main()
     assert not place.exists()
     assert list(place.parent.iterdir()) == []

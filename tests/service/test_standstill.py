@@ -179,7 +179,7 @@ def test_the_inputs_of_a_job_that_stood_still_are_kept(bench: Bench) -> None:
     bench.store.add_upload(upload)
     asked = {"tiles": (InputReference(kind="upload", value=upload.upload_id),)}
     request = JobRequest(**asked)
-    bench.store.create(request, owner=None, max_queued=9, max_queued_per_key=9)
+    bench.store.create(request, owner=None)
     for days, expired in ((30.0, []), (0.0, [upload.upload_id])):
         claimed = bench.store.claim("d", lease_s=30.0, max_attempts=3)
         assert claimed is not None
@@ -193,7 +193,7 @@ def test_the_inputs_of_a_job_that_stood_still_are_kept(bench: Bench) -> None:
         assert (place in tidy_jobs(bench.store, bench.folder, days)) == (not days)
         assert place.exists() == bool(days)
         bench.store.remove(claimed.job_id)
-        bench.store.create(request, owner=None, max_queued=9, max_queued_per_key=9)
+        bench.store.create(request, owner=None)
 
 
 # --- the folder of an attempt

@@ -2,7 +2,6 @@
 
 import asyncio
 import base64
-import contextlib
 import dataclasses
 import datetime as dt
 import errno
@@ -24,16 +23,14 @@ from hypothesis import strategies as st
 from live_service import DEADLINE_S, POINTS, add_key, answer_to, las_bytes, raw_request, serving, settings_in
 from processes import wait_for
 
-from pipeline.errors import InputError
 from service import preflight, uploads
 from service.deliveries import Delivery
 from service.errors import NoSpaceError, RequestError, TooLargeError, TooManyUploadsError
 from service.filenames import NAME_LIMIT, SUFFIXES, clean_filename
 from service.files import StateFolder
-from service.jobs import InputReference, JobRequest, Upload
+from service.jobs import Upload
 from service.keys import Scope
 from service.settings import ServiceSettings
-from service.store import JobStore
 from service.uploads import TEMPORARY, receive, remove_leftovers
 
 NOW = dt.datetime(2026, 3, 1, tzinfo=dt.UTC)
@@ -155,12 +152,6 @@ def test_an_upload_is_stored_under_its_id_with_its_hash_and_what_its_header_says
     json.dumps(dict(upload.preflight), allow_nan=False)
 
 
-def test_the_same_content_twice_is_two_uploads(tmp_path: Path) -> None:
-    first, second = (take(tmp_path, las_bytes(10)) for _ in range(2))
-    assert first.upload_id != second.upload_id
-    assert len(files_in(tmp_path)) == 2
-
-
 def test_one_byte_more_than_the_limit_is_refused_and_the_limit_itself_is_not(tmp_path: Path) -> None:
     content = las_bytes(100)
     take(tmp_path / "fits", content, max_upload_bytes=len(content))
@@ -209,26 +200,11 @@ def test_a_full_disk_is_reported_as_such_and_leaves_nothing(tmp_path: Path, monk
     assert list((tmp_path / "uploads").iterdir()) == []
 
 
-def test_a_file_that_cannot_be_used_is_refused_by_its_name_without_its_folder(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"^tile\.laz: ") as caught:
-        take(tmp_path, b"no points here" * 100)
-    assert str(tmp_path) not in str(caught.value)
-    assert list((tmp_path / "uploads").iterdir()) == []
-
-
 def test_a_geographic_crs_is_taken_and_reported_for_a_job_may_name_another(tmp_path: Path) -> None:
     upload = take(tmp_path, las_bytes(10, crs="EPSG:4326"))
     assert upload.preflight["usable"] is False
     assert "is geographic" in upload.preflight["problems"][0]
     assert upload.preflight["pointCount"] == 10
-
-
-def test_bytes_that_are_not_those_promised_are_refused(tmp_path: Path) -> None:
-    content = las_bytes(10)
-    take(tmp_path / "right", content, sha256=hashlib.sha256(content).hexdigest())
-    with pytest.raises(RequestError, match="as promised: send it again"):
-        take(tmp_path / "wrong", content, sha256="0" * 64)
-    assert files_in(tmp_path / "wrong") == []
 
 
 def test_a_large_upload_is_never_held_in_memory(tmp_path: Path) -> None:
@@ -405,18 +381,6 @@ def test_a_body_that_says_it_is_too_long_is_refused_before_it_is_sent(url: str) 
         assert link.recv(100).startswith(b"HTTP/1.1 413")
 
 
-def test_a_chunked_body_is_cut_off_at_the_limit(client: httpx.Client, settings: ServiceSettings) -> None:
-    def endless() -> Iterator[bytes]:
-        for _ in range(100):
-            yield b"\0" * 65_536
-
-    before = sorted(StateFolder(settings.state).uploads.iterdir())
-    # The server closes while we still write; which of the two comes first is the system's business.
-    with contextlib.suppress(httpx.WriteError):
-        assert client.post("/uploads?filename=a.laz", content=endless()).status_code == 413
-    assert sorted(StateFolder(settings.state).uploads.iterdir()) == before
-
-
 def test_a_client_that_goes_away_leaves_nothing_behind(tmp_path: Path) -> None:
     settings = settings_in(tmp_path)
     with serving(settings) as url:
@@ -425,18 +389,6 @@ def test_a_client_that_goes_away_leaves_nothing_behind(tmp_path: Path) -> None:
         with raw_request(url, "POST /uploads?filename=a.laz", body, Content_Length="9000000"):
             wait_for(lambda: list(folder.glob(f"{TEMPORARY}*/a.laz")), "the beginning of an upload")
         eventually_empty(folder)
-
-
-def test_an_upload_that_a_waiting_job_needs_cannot_be_removed(client: httpx.Client, settings: ServiceSettings) -> None:
-    upload_id = client.post("/uploads?filename=a.laz", content=las_bytes(10)).json()["uploadID"]
-    request = JobRequest(tiles=(InputReference(kind="upload", value=upload_id),))
-    with JobStore(settings.database) as store:
-        job = store.create(request, owner=None, max_queued=10, max_queued_per_key=10)
-        answer = client.delete(f"/uploads/{upload_id}")
-        assert answer.status_code == 409
-        assert upload_id in problem(answer)
-        store.dismiss(job.job_id)
-    assert client.delete(f"/uploads/{upload_id}").status_code == 204
 
 
 @pytest.mark.parametrize(

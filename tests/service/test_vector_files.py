@@ -2,7 +2,6 @@
 
 import io
 import json
-import re
 import sqlite3
 import zipfile
 from pathlib import Path
@@ -16,14 +15,13 @@ from driver_bench import Bench
 from live_service import las_bytes
 
 from pipeline.errors import InputError
-from pipeline.io.formats import POINT_SUFFIXES
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.resources import Resources
 from pipeline.runtime.run import RunSummary, run
 from service.driver.attempt import classify_request, compare_request, run_request
 from service.errors import RequestError, TooLargeError
 from service.fetching import Fetched, JobFiles
-from service.filenames import FOOTPRINT_SUFFIXES, clean_filename
+from service.filenames import clean_filename
 from service.jobs import Fault, InputReference, JobRequest, JobStatus
 from service.preflight import examine
 from service.settings import ServiceSettings
@@ -116,13 +114,6 @@ def test_a_format_that_is_not_read_is_refused_with_the_fix_by_name_and_by_conten
 def test_a_shapefile_alone_is_refused_with_the_way_to_send_it() -> None:
     with pytest.raises(RequestError, match=r"'houses\.shp' cannot be used: .* Send them in a zip archive"):
         clean_filename("houses.shp")
-
-
-def test_the_page_offers_the_files_that_are_taken() -> None:
-    page = (Path(__file__).parents[2] / "service/viewer/src/submit/submission.ts").read_text()
-    for name, taken in (("TILE", POINT_SUFFIXES), ("VECTOR", FOOTPRINT_SUFFIXES)):
-        (offered,) = re.findall(rf'const {name}_ENDINGS = "(.*)";', page)
-        assert sorted(offered.split(",")) == sorted(taken)
 
 
 def test_an_archive_counts_as_what_is_in_it(tmp_path: Path) -> None:

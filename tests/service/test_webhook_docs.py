@@ -10,7 +10,7 @@ import httpx
 import pytest
 from processes import Programs, free_port, programs
 
-from service.webhooks import new_secret, signed_headers
+from service.webhooks import EventType, new_secret, signed_headers
 
 __all__ = ["programs"]
 
@@ -39,3 +39,7 @@ def test_the_receiver_of_the_docs_takes_what_is_signed_and_nothing_else(programs
     foreign = signed_headers(new_secret(), "c" * 32, now_s, body)
     for headers, content in ((good, body + b" "), (old, body), (foreign, body)):
         assert httpx.post(url, content=content, headers=headers).status_code == 401
+
+
+def test_the_page_has_every_event() -> None:
+    assert {event.value for event in EventType} == set(re.findall(r"`(job\.[a-z]+)`", PAGE.read_text()))

@@ -6,11 +6,8 @@ from typing import Any
 import pytest
 from webhook_store_contract import settle, take
 
-from service.errors import ServiceError
-from service.jobs import JobStatus, Subscriber
+from service.jobs import Subscriber
 from service.keys import Scope
-from service.settings import ServiceSettings
-from service.store import DeliveryFilter
 from service.webhooks import EventType, Result, retry_policy
 
 LISTED = "http://127.0.0.1:9"
@@ -215,22 +212,6 @@ def test_the_metrics_count_deliveries(local_service) -> None:
 # --- limits, and webhooks that do not keep up
 
 
-def test_a_key_makes_so_many_webhooks_and_the_refusal_says_what_to_do(starting) -> None:
-    service = starting(webhook_hosts=(LISTED,), open_without_keys=False, max_webhooks_per_key=2)
-    first, second = service.key(Scope.ADMIN), service.key(Scope.ADMIN)
-    made = [make(service, first) for _ in range(2)]
-    refused = service.client.post("/webhooks", json={"url": HOOK}, headers=first)
-    assert (refused.status_code, refused.json()["type"]) == (409, "urn:gablework:problem:too-many-webhooks")
-    assert "there are 2 webhooks of this key, the limit is 2: remove one, or raise" in refused.json()["detail"]
-    make(service, second)
-    assert service.client.delete(f"/webhooks/{made[0]['webhookID']}", headers=first).status_code == 204
-    make(service, first)
-
-
-def test_at_least_a_hundred_webhooks_of_a_key_are_allowed() -> None:
-    assert ServiceSettings.model_fields["max_webhooks_per_key"].default >= 100
-
-
 def test_a_webhook_is_sent_what_failed_when_its_owner_replays_it(local_service) -> None:
     store = local_service.store
     place = f"/webhooks/{make(local_service, events=['job.dismissed'])['webhookID']}"
@@ -293,12 +274,3 @@ def test_each_key_reads_and_replaces_its_own_secret(keyed) -> None:
     assert client.get("/webhooks/secret", headers=mine).json() == rotated
     assert client.get("/webhooks/secret", headers=keyed.key(Scope.READ)).status_code == 403
     assert client.get("/webhooks/secret").status_code == 401
-
-
-def test_a_job_that_was_not_made_has_no_news(local_service) -> None:
-    make(local_service, events=["job.accepted"])
-    with pytest.raises(ServiceError):
-        local_service.store.create(local_service.waiting().request, owner=None, max_queued=1, max_queued_per_key=1)
-    listed = local_service.store.webhooks.deliveries(DeliveryFilter())
-    assert [one.event for one in listed] == [EventType.ACCEPTED]
-    assert local_service.store.get(listed[0].job_id).status is JobStatus.ACCEPTED

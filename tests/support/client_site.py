@@ -129,7 +129,7 @@ class Site:
     def echoed(self, **request: Any) -> Job:
         """A job that waits."""
         asked = JobRequest(process_id="echo", tiles=(), echo={"message": "hello", "delay": 0.0}, **request)
-        return self.store.create(asked, owner=None, max_queued=1000, max_queued_per_key=1000)
+        return self.store.create(asked, owner=None)
 
 
 def event(kind: str, **values: Any) -> JobEvent:

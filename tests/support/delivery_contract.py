@@ -39,7 +39,7 @@ class DeliveryContract(DatabaseContract):
 
         def create(claim: Claim) -> Job:
             delivery = Delivery(claim=claim, answer=answer, kept_s=HOUR_S)
-            return store.create(request(), owner=None, max_queued=10, max_queued_per_key=10, delivery=delivery)
+            return store.create(request(), owner=None, delivery=delivery)
 
         with pytest.raises(KeyInUseError):
             create(second)

@@ -206,7 +206,7 @@ class Bench:
 
     def submit(self, asked: Mapping[str, Any] | None = None, **values: Any) -> Job:
         request = JobRequest(tiles=(InputReference(kind="path", value="/data/a.laz"),), **(asked or {}))
-        return self.store.create(request, owner=None, max_queued=100, max_queued_per_key=100, **values)
+        return self.store.create(request, owner=None, **values)
 
     def becomes(self, job: Job, *statuses: JobStatus) -> Job:
         def there() -> Job | None:

@@ -260,7 +260,7 @@ class Service:
         """A job that a driver holds."""
         tiles = (InputReference(kind="path", value=f"{SERVER_FOLDER}/tile.laz"),)
         owner = request.pop("owner", None)
-        self.store.create(JobRequest(tiles=tiles, **request), owner=owner, max_queued=99, max_queued_per_key=99)
+        self.store.create(JobRequest(tiles=tiles, **request), owner=owner)
         job = self.store.claim("a driver", lease_s=3600.0, max_attempts=3)
         assert job is not None
         return job

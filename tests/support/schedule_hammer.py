@@ -18,7 +18,7 @@ def main(url: str, start: dt.datetime, step: dt.timedelta, number_of_ticks: int,
         for number in range(number_of_ticks):
             if number % lap == 0 and not sys.stdin.readline():
                 sys.exit("the test has ended")
-            entries = store.schedules.tick(now=start + number * step, max_queued=10**6, max_queued_per_key=10**6)
+            entries = store.schedules.tick(now=start + number * step)
             for run in entries:
                 if run.outcome is Outcome.SUBMITTED and run.job_id is not None:
                     print(run.job_id, flush=True)

@@ -67,7 +67,7 @@ class Stocking:
         self._store.close()
 
     def _running(self, asked: JobRequest) -> Job:
-        made = self._store.create(asked, owner=None, max_queued=999, max_queued_per_key=999)
+        made = self._store.create(asked, owner=None)
         job = self._store.claim(DRIVER, lease_s=10 * 86_400.0, max_attempts=3)
         assert job is not None
         assert job.job_id == made.job_id, "another job waited"
@@ -113,10 +113,10 @@ class Stocking:
         paused = self._schedule("Once a year", is_paused=True)
         now = store.now()
         for night in range(NIGHTS):
-            store.schedules.tick(max_queued=999, max_queued_per_key=999, now=now + dt.timedelta(days=1 + 3 * night))
+            store.schedules.tick(now=now + dt.timedelta(days=1 + 3 * night))
         held = store.claim(DRIVER, lease_s=10 * 86_400.0, max_attempts=3)
         assert held is not None
-        waiting = store.create(echo("Waits in the line"), owner=None, max_queued=999, max_queued_per_key=999)
+        waiting = store.create(echo("Waits in the line"), owner=None)
         return Stock(
             done=job.job_id,
             compared=compared.job_id,

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import sqlalchemy as sa
+from migrated import add_row, at_revision
 from store_contract import DatabaseContract, claim, happened, running, submit, until
 
 from service.errors import (
@@ -17,11 +18,11 @@ from service.errors import (
     NotReplayableError,
     TooManyWebhooksError,
 )
-from service.jobs import Fault, Job, JobFailure, JobStatus, Subscriber
+from service.jobs import Fault, Job, JobFailure, JobRequest, JobStatus, Subscriber
 from service.receivers import Avoided, Receivers
 from service.store import DeliveryFilter, JobStore
 from service.store.tables import WEBHOOK_DELIVERIES, WEBHOOK_EVENTS, WEBHOOK_SECRETS, WEBHOOKS
-from service.webhooks import PROGRESS_S, Delivery, DeliveryState, EventType, Parcel, Result, retry_policy
+from service.webhooks import PROGRESS_S, Delivery, DeliveryState, EventType, Parcel, Result, retry_policy, snapshot_of
 
 URL = "https://hooks.example.org/a"
 SUBSCRIBER = Subscriber(
@@ -576,53 +577,40 @@ class WebhookStoreContract(DatabaseContract):
         logs = [store.webhooks.delivery(one.delivery.delivery_id).log[0] for one in found]
         assert [(one.status, one.error) for one in logs] == [(204, None), (500, REFUSED.error), (None, None)]
 
-    def test_what_waited_for_room_before_the_upgrade_is_sent(self, store: JobStore) -> None:
+    def test_what_waited_for_room_before_the_upgrade_is_sent(self, url: str) -> None:
         """Revision 0011 had events without deliveries, replays that waited, and bodies that endpoints shared."""
-        from alembic import command
-        from schedule_store_contract import migrate
-
-        one = endpoint(store, EventType.ACCEPTED, EventType.DISMISSED)
-        jobs = dismissed(store, 2)
-        sent = take(store)
-        settle(store, sent, TAKEN)
-        with store._database.write() as connection:
-            migrate(connection, command.downgrade, "0011")
-            # as that version left it: the first end was never put in line, the second one waits for its replay
-            words = [
-                "UPDATE webhooks SET sent_until = (SELECT MIN(at) FROM webhook_events), is_behind = (1 = 1)",
-                "UPDATE webhook_events SET body = '{}', base = 'http://h'",
-                "UPDATE webhook_deliveries SET body = NULL",
-                f"DELETE FROM webhook_deliveries WHERE job_id = '{jobs[0]}' AND event = 'job.dismissed'",
-            ]
-            lost = f"job_id = '{jobs[1]}' AND event = 'job.dismissed'"
-            values = "state = 'failed', due_at = NULL, finished_at = created_at, replay_at = created_at"
-            words.append(f"UPDATE webhook_deliveries SET {values} WHERE {lost}")
-            for statement in words:
-                connection.exec_driver_sql(statement)
-        store.migrate()
-        assert store.webhooks.delivery(sent.delivery.delivery_id).body == "{}"
-        assert Counter(events(store, endpoint_id=one)) == {"job.accepted": 2, "job.dismissed": 2}
-        ends = [parcel for parcel in send_all(store) if parcel.delivery.event.is_end]
-        assert Counter(parcel.delivery.job_id for parcel in ends) == Counter(jobs)
-        assert {parcel.job.status for parcel in ends} == {JobStatus.DISMISSED}
-
-    def test_jobs_that_were_submitted_before_webhooks_go_on(self, store: JobStore) -> None:
-        """The upgrade with a job in flight: its stored request has no subscriber."""
-        held: Job = running(store)
-        with store._database.write() as connection:
-            row = connection.exec_driver_sql("SELECT request FROM jobs").scalar_one()
-        assert "subscriber" in str(row)
-        from alembic import command
-        from schedule_store_contract import migrate
-
-        from service.store.tables import JOBS
-
-        old = {name: value for name, value in held.request.as_dict().items() if name != "subscriber"}
-        with store._database.write() as connection:
-            connection.execute(sa.update(JOBS).values(request=old))
-            migrate(connection, command.downgrade, "0004")
-        store.migrate()
-        endpoint(store)
-        store.succeed(held, message="done", summary={})
-        assert events(store) == ["job.successful"]
-        assert store.get(held.job_id).request == held.request
+        at, hook = dt.datetime(2026, 1, 1, tzinfo=dt.UTC), "e" * 32
+        ended = Job(
+            job_id="a" * 32,
+            owner=None,
+            request=JobRequest(tiles=()),
+            status=JobStatus.DISMISSED,
+            created_at=at,
+            updated_at=at,
+        )
+        of_job = {"job_id": ended.job_id, "event": "job.dismissed"}
+        snapshot = snapshot_of(ended)
+        with JobStore(url) as store:
+            with at_revision(store, "0011") as connection:
+                known = {"created_at": at, "updated_at": at, "changed_at": at, "sent_until": at - dt.timedelta(hours=1)}
+                known |= {"events": ["job.dismissed"], "is_enabled": True, "secret": "whsec_AAAA", "is_behind": True}
+                add_row(connection, "webhooks", endpoint_id=hook, url=URL, base="http://h", **known)
+                for number in range(3):
+                    event = {"event_id": f"{number:032x}", "at": at, "snapshot": snapshot, **of_job}
+                    add_row(connection, "webhook_events", base="http://h", body=f"{{{number}}}", **event)
+                to = {"endpoint_id": hook, "url": URL, "base": "http://h", "created_at": at, "tried_since": at}
+                to |= {"snapshot": None, "attempts": 1, "finished_at": at, **of_job}
+                rows = [{"state": "delivered", "event_id": "0" * 32}]
+                rows += [{"state": "failed", "event_id": f"{1:032x}", "replay_at": at}]
+                # older than the table of events
+                rows += [{"state": "delivered", "snapshot": snapshot, "body": "{}"}]
+                for number, row in enumerate(rows):
+                    add_row(connection, "webhook_deliveries", **to | {"delivery_id": f"d{number:031x}"} | row)
+            store.migrate()
+            assert [store.webhooks.delivery(f"d{number:031x}").body for number in (0, 2)] == ["{0}", "{}"]
+            assert len(log(store)) == 4
+            sent = send_all(store)
+            assert {parcel.job.status for parcel in sent} == {JobStatus.DISMISSED}
+            assert len(sent) == 2
+            store.webhooks.replay(f"d{2:031x}")
+            assert take(store).job.job_id == ended.job_id

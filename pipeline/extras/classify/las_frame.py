@@ -12,11 +12,12 @@ from pathlib import Path
 from pipeline.errors import UnreadableInputError
 from pipeline.io.las_header import (
     EVLR_HEADER_SIZE,
-    EVLR_LIMIT,
     HEADER_SIZES,
     REWRITE,
     VLR_HEADER_SIZE,
+    ExtendedRecord,
     HeaderBlock,
+    extended_records,
     read_header_block,
 )
 
@@ -35,22 +36,6 @@ class VariableRecord:
     """(32 bytes) as in the file."""
     data: bytes
     """What it holds."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class ExtendedRecord:
-    """Where an extended variable length record (EVLR) is; it can be gigabytes."""
-
-    user_id: bytes
-    """Who defines it, without the zeros at its end."""
-    record_id: int
-    """Which of theirs it is."""
-    description: bytes
-    """(32 bytes) as in the file."""
-    offset: int
-    """Byte at which its data begin."""
-    size: int
-    """Bytes of data."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -95,23 +80,9 @@ def read_frame(path: Path) -> LasFrame:
                     data=stream.read(length),
                 )
             )
-        extended, at = [], block.first_evlr
-        for _ in range(min(block.evlr_count, EVLR_LIMIT)):
-            stream.seek(at)
-            head = stream.read(EVLR_HEADER_SIZE)
-            length = struct.unpack_from("<Q", head, 20)[0] if len(head) == EVLR_HEADER_SIZE else block.file_size
-            if at + EVLR_HEADER_SIZE + length > block.file_size:
-                raise UnreadableInputError(
-                    str(path), f"truncated: the extended record at byte {at} leads out of the file", REWRITE
-                )
-            extended.append(
-                ExtendedRecord(
-                    user_id=head[2:18].split(b"\0")[0],
-                    record_id=struct.unpack_from("<H", head, 18)[0],
-                    description=head[28:60],
-                    offset=at + EVLR_HEADER_SIZE,
-                    size=length,
-                )
-            )
-            at += EVLR_HEADER_SIZE + length
-    return LasFrame(block=block, header=header, records=tuple(records), extended=tuple(extended))
+        extended = tuple(extended_records(stream, block))
+    if extended and extended[-1].offset + extended[-1].size > block.file_size:
+        at = extended[-1].offset - EVLR_HEADER_SIZE
+        problem = f"truncated: the extended record at byte {at} leads out of the file"
+        raise UnreadableInputError(str(path), problem, REWRITE)
+    return LasFrame(block=block, header=header, records=tuple(records), extended=extended)

@@ -1,9 +1,9 @@
-"""The chance that a point of a sparse survey is building, by what lies within 10 m of it.
+"""The chance that a point of a sparse survey is building, from its surroundings within 10 m.
 
-Where one or two points lie on a square metre, or fewer, no surface shows by itself where a roof ends and a tree begins.
-Several weak signs do so together: pulses that go on, how much of what stands around is on the point's level, how far
-candidates are and how much of the surroundings they hold. A logistic regression weighs them. The weights were fitted at
-commit 01fb6cec by `benchmarks/sparse_points.py`, which also scored them on places that they were not fitted on.
+With two points per square metre or fewer, no single surface shows where a roof ends and a tree begins. Several weak
+signs do so together: pulses that go on, the share of the surroundings on the point's level, and the distance and share
+of candidates. A logistic regression weighs them. The weights were fitted at commit 01fb6cec by
+`benchmarks/sparse_points.py`, which also scored them on places that they were not fitted on.
 
 All counts are whole numbers, and each point's terms are computed alone: the chance does not depend on tiles or order.
 """

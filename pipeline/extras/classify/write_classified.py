@@ -1,4 +1,4 @@
-"""Classified files: every input read again and written as LAZ 1.4, its points unchanged but for their classes."""
+"""Classified files: every input read again and written as LAZ 1.4, its points unchanged except for their classes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import numpy.typing as npt
 from pipeline import __version__
 from pipeline.errors import InconsistentInputError, UnreadableInputError
 from pipeline.extras.classify.label import class_path
-from pipeline.extras.classify.las_frame import ExtendedRecord, LasFrame, read_frame
+from pipeline.extras.classify.las_frame import LasFrame, read_frame
 from pipeline.extras.classify.laz_writing import (
     KEEP,
     NEWER_FORMAT,
@@ -29,8 +29,9 @@ from pipeline.extras.classify.laz_writing import (
 )
 from pipeline.io import LocalStorage, ReadOptions, Source, SourceInfo, open_source
 from pipeline.io.crs import SpatialReference
+from pipeline.io.formats import LAS
 from pipeline.io.las import LasFile
-from pipeline.io.las_header import WKT_RECORD_ID
+from pipeline.io.las_header import WKT_RECORD_ID, ExtendedRecord
 from pipeline.io.records import PointRecords
 from pipeline.io.storage import BLOCK_BYTES
 from pipeline.model import ByteArray, PointCloud
@@ -42,7 +43,6 @@ CHUNK_POINTS = 500_000
 PROJECTION = b"LASF_Projection"
 GEOTIFF_RECORDS = (34735, 34736, 34737)
 SOFTWARE = f"gablework {__version__}"
-_LAS_FORMATS = ("las", "laz", "copc")
 _FIX = "Leave the inputs alone until the command has ended"
 _SCALE = 0.001
 """Units of the CRS in which points of files without integer coordinates are written."""
@@ -100,7 +100,7 @@ def output_name(path: str) -> str:
 
 def check_writable(info: SourceInfo) -> None:
     """Refuse a file that cannot be written anew without loss, before any work."""
-    if info.format not in _LAS_FORMATS:
+    if info.format not in LAS.encodings:
         return
     frame = read_frame(Path(info.path))
     if frame.block.point_format in WAVEFORM_FORMATS:

@@ -17,10 +17,10 @@ import shapely
 from shapely import MultiPolygon, Polygon
 
 from pipeline.errors import EmptyInputError, InconsistentInputError, UnreadableInputError
-from pipeline.extras.footprints.placed_features import NOT_ELSEWHERE, Elsewhere, boxes_around, in_metres
+from pipeline.extras.footprints.placed_features import boxes_around, in_metres, left_out, usable, within
 from pipeline.extras.footprints.repairs import EDGES_LIMIT, LOOKS_OF_FILE, Repairs, crossings
-from pipeline.extras.vector_files.nearby import AREAS, POLYGONS, Shape
-from pipeline.extras.vector_files.vector_layer import VectorLayer, read_layer
+from pipeline.extras.vector_files.nearby import AREAS, POLYGONS, Elsewhere, Shape
+from pipeline.extras.vector_files.vector_layer import read_layer
 from pipeline.io.crs import LARGEST_COORDINATE, SpatialReference
 from pipeline.io.locations import shown
 
@@ -42,21 +42,6 @@ ID_COLUMNS = (
 )
 """Columns that hold a building's own id. The first one without gaps and repeats counts, else the one with fewest."""
 
-PROBLEMS = {
-    "no_geometry": "without a geometry",
-    "unreadable": "with a geometry that cannot be read",
-    "not_polygon": "no polygons",
-    "empty": "empty",
-    "not_finite": "with coordinates that are NaN or infinite",
-    "outside_crs": "outside the run's CRS",
-    "too_large": "larger than any building",
-    "no_area": "invalid and without area",
-    "invalid": "invalid",
-    "tangled": "invalid with too many crossings to be repaired",
-    "bad_value": "with an attribute that cannot be used",
-    "overlap": "covered by another one",
-}
-"""What can be wrong with a footprint, and how a message counts it."""
 LARGEST_OUTLINE_M = 20_000.0
 """Longest side of an outline. Not a setting: the longest buildings have 3 km, and a wrong coordinate makes an outline
 that reaches over thousands of tiles."""
@@ -106,7 +91,7 @@ class Footprints:
     """What was repaired, left out or assumed, one sentence each."""
     issues: tuple[FootprintIssue, ...] = ()
     """Every feature that was repaired or left out, in the file's order."""
-    elsewhere: Elsewhere = NOT_ELSEWHERE
+    elsewhere: Elsewhere = dataclasses.field(default_factory=Elsewhere)
     """Polygons of the file that were passed over."""
 
     def __len__(self) -> int:
@@ -169,14 +154,14 @@ def read_footprints(
     warnings += found.warnings
     problems: dict[int, tuple[str, str]] = {}
     actions: dict[int, str] = {}
-    geometries = _polygons_only(found, problems)
+    geometries = usable(found, POLYGONS, problems)
     kept = np.flatnonzero(~shapely.is_missing(geometries))
-    if len(kept) == 0 and not found.elsewhere:
+    if len(kept) == 0 and not found.elsewhere.count:
         lost = f"none of the {len(found.geometries)} features is a polygon"
         raise EmptyInputError(name, lost, "Give polygons of buildings")
     polygons = shapely.force_2d(geometries[kept])
     polygons = in_metres(name, shape.named, polygons, found.crs if crs is None else crs, reference, warnings)
-    whole = _within(polygons, LARGEST_COORDINATE)
+    whole = within(polygons, LARGEST_COORDINATE)
     for row in kept[~whole].tolist():
         problems[row] = ("outside_crs", "it cannot be reprojected to the run's CRS")
     polygons, kept = polygons[whole], kept[whole]
@@ -186,7 +171,7 @@ def read_footprints(
     polygons = _repaired(polygons, kept, problems, actions)
     solid = ~shapely.is_empty(polygons)
     polygons, kept = polygons[solid], kept[solid]
-    if len(kept) == 0 and not found.elsewhere:
+    if len(kept) == 0 and not found.elsewhere.count:
         size = f" of at most {largest_m:g} m" if len(small) > small.sum() else ""
         raise EmptyInputError(name, f"no polygon{size} has an area", "Give polygons of buildings")
     table = {field: [_plain(value) for value in column] for field, column in found.columns.items()}
@@ -210,7 +195,7 @@ def read_footprints(
         columns=tuple(found.columns),
         warnings=(*warnings, *_summary(issues)),
         issues=issues,
-        elsewhere=Elsewhere(found.elsewhere, found.bounds_elsewhere, found.crs if crs is None else crs),
+        elsewhere=found.elsewhere if crs is None else dataclasses.replace(found.elsewhere, crs=crs),
     )
 
 
@@ -230,45 +215,12 @@ def _small_enough(
     return small
 
 
-def _polygons_only(layer: VectorLayer, problems: dict[int, tuple[str, str]]) -> npt.NDArray[np.object_]:
-    """Geometries, None if a feature is not a polygon; the reason goes to the problems, by row."""
-    geometries = layer.geometries.copy()
-    kinds = shapely.get_type_id(geometries)
-    polygonal = np.isin(kinds, (shapely.GeometryType.POLYGON, shapely.GeometryType.MULTIPOLYGON))
-    for row in np.flatnonzero(~polygonal).tolist():
-        if layer.unreadable[row]:
-            problems[row] = ("unreadable", "its geometry cannot be read")
-        elif kinds[row] < 0:
-            problems[row] = ("no_geometry", "it has no geometry")
-        else:
-            problems[row] = ("not_polygon", f"it is a {geometries[row].geom_type}")
-    for row in np.flatnonzero(polygonal & shapely.is_empty(geometries)).tolist():
-        problems[row] = ("empty", "its polygon is empty")
-    for row in np.flatnonzero(polygonal & ~_within(geometries, np.finfo(np.float64).max)).tolist():
-        problems.setdefault(row, ("not_finite", "it has coordinates that are NaN or infinite"))
-    geometries[list(problems)] = None
-    return geometries
-
-
-def _within(geometries: npt.NDArray[np.object_], largest: float) -> npt.NDArray[np.bool_]:
-    """(n,) bool, whether all coordinates are numbers up to the largest; bounds do not show it, they pass over NaN."""
-    xy, owners = shapely.get_coordinates(geometries, return_index=True)
-    within = np.ones(len(geometries), np.bool_)
-    within[owners[~(np.abs(xy) <= largest).all(axis=1)]] = False
-    return within
-
-
 def _summary(issues: Sequence[FootprintIssue]) -> list[str]:
     """What was left out and repaired, in one sentence each."""
-    left_out = Counter(issue.problem for issue in issues if issue.action == "left out")
-    warnings = []
-    if left_out:
-        reasons = ", ".join(f"{count} {PROBLEMS[problem]}" for problem, count in left_out.items())
-        warnings.append(f"{left_out.total()} features are left out: {reasons}")
-    n_repaired = len(issues) - left_out.total()
-    if n_repaired:
-        warnings.append(f"{n_repaired} footprints are invalid and were repaired")
-    return warnings
+    lost = [issue.problem for issue in issues if issue.action == "left out"]
+    n_repaired = len(issues) - len(lost)
+    repaired = [f"{n_repaired} footprints are invalid and were repaired"] if n_repaired else []
+    return [*left_out(lost, "features"), *repaired]
 
 
 def _repaired(

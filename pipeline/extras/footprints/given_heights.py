@@ -1,4 +1,4 @@
-"""Given heights: the attributes of a footprint stand in where points are missing, as a labelled block."""
+"""Given heights: the attributes of a footprint replace missing points by a labelled block."""
 
 from __future__ import annotations
 

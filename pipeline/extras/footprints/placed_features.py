@@ -1,10 +1,10 @@
-"""Features of a vector file, placed in the CRS of a run: where to look for them, and their geometries in metres."""
+"""Features of a vector file, placed in the CRS of a run: the area to search, and their geometries in metres."""
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,6 +12,7 @@ import numpy.typing as npt
 import shapely
 
 from pipeline.errors import CrsError, EmptyInputError, InputError
+from pipeline.extras.vector_files.nearby import Elsewhere, Shape, VectorLayer
 from pipeline.io.crs import SpatialReference, horizontal_part, horizontal_unit_of
 from pipeline.io.crs_given import parse_crs
 
@@ -26,20 +27,58 @@ AROUND_M = 100.0
 """How far off an area features are still read: more than its edges bend, and operations differ, between two CRS."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
-class Elsewhere:
-    """The features of a file that were passed over, since they lie off the area that was asked for."""
+PROBLEMS = {
+    "no_geometry": "without a geometry",
+    "unreadable": "with a geometry that cannot be read",
+    "not_polygon": "no polygons",
+    "not_line": "no lines",
+    "empty": "empty",
+    "not_finite": "with coordinates that are NaN or infinite",
+    "outside_crs": "outside the run's CRS",
+    "unknown_kind": "of an unknown kind",
+    "too_large": "larger than any building",
+    "no_area": "invalid and without area",
+    "invalid": "invalid",
+    "tangled": "invalid with too many crossings to be repaired",
+    "bad_value": "with an attribute that cannot be used",
+    "overlap": "covered by another one",
+}
+"""What can be wrong with a feature, and how a message counts it."""
 
-    count: int = 0
-    """Their number."""
-    bounds: tuple[float, ...] | None = None
-    """xmin, ymin, xmax, ymax of all in the file's CRS; None where there are none."""
-    crs: str | None = None
-    """That CRS; None where it is unknown."""
+
+def usable(layer: VectorLayer, shape: Shape, problems: dict[int, tuple[str, str]]) -> npt.NDArray[np.object_]:
+    """The geometries of a shape, None for all others; what is wrong with these goes to the problems, by row."""
+    geometries = layer.geometries.copy()
+    kinds = shapely.get_type_id(geometries)
+    fits = np.isin(kinds, shape.kinds)
+    for row in np.flatnonzero(~fits).tolist():
+        if layer.unreadable[row]:
+            problems[row] = ("unreadable", "its geometry cannot be read")
+        elif kinds[row] < 0:
+            problems[row] = ("no_geometry", "it has no geometry")
+        else:
+            problems[row] = (f"not_{shape.one}", f"it is a {geometries[row].geom_type}")
+    for row in np.flatnonzero(fits & shapely.is_empty(geometries)).tolist():
+        problems[row] = ("empty", f"its {shape.one} is empty")
+    for row in np.flatnonzero(fits & ~within(geometries, np.finfo(np.float64).max)).tolist():
+        problems.setdefault(row, ("not_finite", "it has coordinates that are NaN or infinite"))
+    geometries[list(problems)] = None
+    return geometries
 
 
-NOT_ELSEWHERE = Elsewhere()
-"""None."""
+def within(geometries: npt.NDArray[np.object_], largest: float) -> npt.NDArray[np.bool_]:
+    """(n,) bool, whether all coordinates are numbers up to the largest; bounds do not show it, they pass over NaN."""
+    xy, owners = shapely.get_coordinates(geometries, return_index=True)
+    found = np.ones(len(geometries), np.bool_)
+    found[owners[~(np.abs(xy) <= largest).all(axis=1)]] = False
+    return found
+
+
+def left_out(problems: Iterable[str], what: str) -> list[str]:
+    """How many features were left out, by problem, in one sentence; empty without any."""
+    counted = Counter(problems)
+    reasons = ", ".join(f"{count} {PROBLEMS[problem]}" for problem, count in counted.items())
+    return [f"{counted.total()} {what} are left out: {reasons}"] if counted else []
 
 
 def boxes_around(

@@ -1,7 +1,7 @@
-"""Repairs invalid polygons that a stranger drew, within a limit of work.
+"""Repairs invalid polygons from untrusted files, within a limit of work.
 
 A star of 101 corners has 5100 crossings and takes GEOS eight seconds; one of 301 corners takes hours. The work is
-therefore counted beforehand, by what it grows with. It depends on the polygons alone, never on time.
+therefore estimated beforehand from the number of crossings. It depends on the polygons alone, never on time.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Roofs alone: given footprints around which nothing was seen, as in points that were clipped to them.
 
-The ground filter believes in the lowest points that it sees. Where these are eaves, a roof would lie on itself, so such
-cells are kept from it. Where the points were clipped with a margin, the ground is at the rim of what is left, a wall's
-height below the roofs: a roof falls to its eaves by its slope, and to the ground by a step. How high a step must be
-depends on the slope of the roof itself, so that steep eaves are no ground and the ground beside low sheds is.
+The ground filter takes the lowest points for ground. If these are eaves, the roof itself would become ground, so the
+filter does not get such cells. If the points were clipped with a margin, the ground lies at the rim, a wall's height
+below the roofs: a roof falls to its eaves by its slope, and to the ground by a step. The least height of a step depends
+on the slope of the roof, so that steep eaves are not ground and the ground beside low sheds is.
 """
 
 from __future__ import annotations

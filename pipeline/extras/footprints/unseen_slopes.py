@@ -1,10 +1,10 @@
 """The side of a roof that no pulse reached: it continues what the seen side and the footprint suggest.
 
 A strip of the survey may end on a ridge, or a wall may hide the far side of a house. In a given footprint such a place
-has no point at all, neither of the roof nor of the ground. A seen slope that rises into it goes on up to the middle of
-the footprint between its eave and the far edge, and falls from there at the same pitch. Slopes that pass along the
-place, as those of a hip, go on as well. The roof there is the lowest of them: points on it take part in everything that
-follows, as if they had been seen, and no figure of fit counts them.
+has no point at all, neither of the roof nor of the ground. A seen slope that rises into it continues to the middle
+between its eave and the far edge, and falls from there at the same pitch. Slopes that pass along the place, as at a
+hip, continue as well. The roof there is the lowest of them. Its points take part in all further steps as if they had
+been seen, and no figure of fit counts them.
 """
 
 from __future__ import annotations

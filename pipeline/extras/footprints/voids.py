@@ -1,4 +1,4 @@
-"""Places inside a given outline without a roof point nearby: courtyards that it does not show, demolished parts.
+"""Places inside a given outline without a roof point nearby: courtyards that the outline lacks, demolished parts.
 
 A place farther than the void distance from every roof point starts a void; it extends to where points begin.
 """

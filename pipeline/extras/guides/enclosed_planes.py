@@ -1,4 +1,4 @@
-"""Planes of the regions that guides enclose: where points are few, methods find no plane in a small one."""
+"""Planes of the regions that guides enclose: with few points, methods find no plane in a small region."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Given lines of a roof: which of them concern a building, where they move its outline, and which its faces follow."""
+"""Matches given lines with a building: the lines near it, the edges that they move, and the lines that faces follow."""
 
 from __future__ import annotations
 

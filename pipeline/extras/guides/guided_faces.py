@@ -1,9 +1,8 @@
 """The arrangement with guides that the points do not contradict.
 
-All guides take part at first, and the faces are compared with those without guides. A guide beside which the points
-misfit more than without guides leaves. So does one that opens a step between planes which meet near it: where two
-planes cross, points show their line better than the places of single points do. The rest is arranged again, until none
-leaves.
+All guides take part at first, and the faces are compared with the faces without guides. A guide is dropped if the
+points beside it misfit more than without guides, or if it opens a step between planes that meet near it: the crossing
+of two planes is more certain than a guide. The rest is arranged again, until no guide is dropped.
 """
 
 from __future__ import annotations

@@ -4,35 +4,24 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections import Counter
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import shapely
 from shapely import LineString
 
 from pipeline.errors import EmptyInputError, UnreadableInputError
-from pipeline.extras.footprints.placed_features import Elsewhere, boxes_around, in_metres
-from pipeline.extras.vector_files.nearby import Shape
-from pipeline.extras.vector_files.vector_layer import VectorLayer, read_layer
+from pipeline.extras.footprints.placed_features import boxes_around, in_metres, left_out, usable, within
+from pipeline.extras.vector_files.nearby import Elsewhere, Shape, VectorLayer
+from pipeline.extras.vector_files.vector_layer import read_layer
 from pipeline.io.crs import LARGEST_COORDINATE, SpatialReference
 from pipeline.io.locations import shown
 from pipeline.model import Guide, GuideKind
 
-LINES = Shape("LineString", (shapely.GeometryType.LINESTRING, shapely.GeometryType.MULTILINESTRING), "guides")
+LINES = Shape(
+    "LineString", (shapely.GeometryType.LINESTRING, shapely.GeometryType.MULTILINESTRING), "guides", one="line"
+)
 """What the features are."""
-PROBLEMS = {
-    "no_geometry": "without a geometry",
-    "unreadable": "with a geometry that cannot be read",
-    "not_line": "no lines",
-    "empty": "empty",
-    "not_finite": "with coordinates that are NaN or infinite",
-    "outside_crs": "outside the run's CRS",
-    "unknown_kind": "of an unknown kind",
-}
-"""What can be wrong with a line, and how a message counts it. Such a line is left out."""
 KIND_COLUMN = "kind"
 """The default column of kinds; only this one may be missing."""
 
@@ -96,14 +85,18 @@ def read_guides(
     if kind_column not in found.columns:
         warnings.append(f"the guides have no column {kind_column!r}: all are of kind any")
     problems: dict[int, tuple[str, str]] = {}
-    geometries = _lines_only(found, problems)
+    geometries = usable(found, LINES, problems)
+    with np.errstate(over="ignore"):
+        lengths = shapely.length(geometries)
+    for row in np.flatnonzero(lengths == 0.0).tolist():
+        problems.setdefault(row, ("empty", "its line has no length"))
     kinds = _kinds(found, kind_column, problems)
     kept = np.array([row for row in range(len(geometries)) if row not in problems], np.int64)
     lines = in_metres(name, "guides", shapely.force_2d(geometries[kept]), found.crs, reference, warnings)
-    whole = (np.abs(shapely.bounds(lines)) <= LARGEST_COORDINATE).all(axis=1)
+    whole = within(lines, LARGEST_COORDINATE)
     for row in kept[~whole].tolist():
         problems[row] = ("outside_crs", "it has no place in the run's CRS")
-    if not whole.any() and not found.elsewhere:
+    if not whole.any() and not found.elsewhere.count:
         raise EmptyInputError(name, f"none of the {len(geometries)} features is a line that can be used", "Give lines")
     guides = tuple(
         Guide(kind=kinds[row], line=part)
@@ -115,25 +108,8 @@ def read_guides(
         GuideIssue(feature=int(found.feature_ids[row]), problem=problem, detail=detail)
         for row, (problem, detail) in sorted(problems.items())
     )
-    elsewhere = Elsewhere(found.elsewhere, found.bounds_elsewhere, found.crs)
-    return GivenLines(guides=guides, warnings=(*warnings, *_summary(issues)), issues=issues, elsewhere=elsewhere)
-
-
-def _lines_only(layer: VectorLayer, problems: dict[int, tuple[str, str]]) -> npt.NDArray[np.object_]:
-    """The geometries; what is wrong with those that are not usable lines goes to the problems, by row."""
-    geometries = layer.geometries
-    for row, geometry in enumerate(geometries.tolist()):
-        if layer.unreadable[row]:
-            problems[row] = ("unreadable", "its geometry cannot be read")
-        elif geometry is None:
-            problems[row] = ("no_geometry", "it has no geometry")
-        elif shapely.get_type_id(geometry) not in LINES.kinds:
-            problems[row] = ("not_line", f"it is a {geometry.geom_type}")
-        elif geometry.is_empty or geometry.length == 0.0:
-            problems[row] = ("empty", "its line is empty or has no length")
-        elif not np.isfinite(shapely.get_coordinates(geometry)).all():
-            problems[row] = ("not_finite", "it has coordinates that are NaN or infinite")
-    return geometries
+    warnings += left_out([issue.problem for issue in issues], "guides")
+    return GivenLines(guides=guides, warnings=tuple(warnings), issues=issues, elsewhere=found.elsewhere)
 
 
 def _kinds(layer: VectorLayer, column: str, problems: dict[int, tuple[str, str]]) -> list[GuideKind]:
@@ -147,12 +123,3 @@ def _kinds(layer: VectorLayer, column: str, problems: dict[int, tuple[str, str]]
         if text and text not in valid:
             problems.setdefault(row, ("unknown_kind", f"its kind is {value!r}: use one of {', '.join(valid)}"))
     return kinds
-
-
-def _summary(issues: Sequence[GuideIssue]) -> list[str]:
-    """How many were left out, in one sentence."""
-    if not issues:
-        return []
-    counted = Counter(issue.problem for issue in issues)
-    reasons = ", ".join(f"{count} {PROBLEMS[problem]}" for problem, count in counted.items())
-    return [f"{len(issues)} guides are left out: {reasons}"]

@@ -6,9 +6,9 @@ have none: a line with open ground before it is then drawn back by the mean over
 whose walls are known, else by a usual overhang from the settings. A line without open ground before it, as along a
 neighbour, stays.
 
-A pulse that was split at the eave met the wall with the part of its beam that passed the edge, but its last return is
-recorded on the axis of the beam: too far inside, by about the reach of the mixed pulses. Therefore the last of several
-returns are moved outwards by that reach before a sheet is looked for.
+If a pulse is split at the eave, a part of its beam passes the edge and meets the wall. Its last return is recorded on
+the axis of the beam, too far inside by about the reach of the mixed pulses. The last of several returns therefore move
+outwards by that reach before a sheet is searched for.
 """
 
 from __future__ import annotations

@@ -3,9 +3,9 @@
 The plan within the eaves is cut into cells by the borders of the roof faces and the wall outline. Over each cell the
 building is one interval of heights: from the floor to the roof inside the walls, from the underside to the roof outside
 them. The underside is parallel to the roof, lower by a thickness that is assumed and not measured: a solid cannot have
-an overhang of no thickness. Two neighbouring cells are separated by walls where one interval is without the other. So
-a wall ends at the underside, an eave has a fascia as high as the thickness, and a step between two roof faces goes on
-over the overhang.
+an overhang of no thickness. Walls separate two neighbouring cells wherever their intervals differ. So a wall ends at
+the underside, an eave has a fascia as high as the thickness, and a step between two roof faces continues over the
+overhang.
 
 As in `pipeline.roof.solid`, a vertical line through a plan vertex has one solid vertex per level, and walls take up all
 levels on their way: every edge of the solid belongs to exactly two faces.

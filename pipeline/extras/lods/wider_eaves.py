@@ -1,8 +1,8 @@
-"""Roof faces that reach beyond a given footprint, which shows the walls: each goes on in its plane up to the eaves.
+"""Roof faces that reach beyond a given footprint, which shows the walls: each continues in its plane to the eaves.
 
-The eaves are the footprint's lines with open ground before them, moved outwards. What lies between footprint and eaves
-is divided where the borders of roof faces, continued straight, divide it: a ridge runs on to the verge, a hip to the
-corner of the eaves.
+The eaves are the footprint's lines with open ground before them, moved outwards. The strip between footprint and eaves
+is divided by the straight continuation of the borders of roof faces: a ridge runs to the verge, a hip to the corner of
+the eaves.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The points of one building, cut out of the nodes that hold some, without a numerical library.
 
-The files are those of `point_glb`. Points of one building follow each other there, so its bytes are copied as they
-are; each node of the octree becomes a node of the new file, with the translation and scale of its own.
+The files are those of `pipeline.extras.octree.point_glb`. Points of one building follow each other there, so its bytes
+are copied as they are; each node of the octree becomes a node of the new file, with its own translation and scale.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import sys
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from pipeline.export.glb_container import QUANTIZATION, VERSION, VERTICES, container, read_document
+from pipeline.export.glb_container import QUANTIZATION, VERTICES, GlbFile, read_document
 from pipeline.extras.octree.point_files import INDEX, TILESET
 
 _TYPES = {5123: "H", 5126: "f"}
@@ -67,8 +67,8 @@ class _Cut:
         """Origin of the node's coordinates."""
         self.node: dict[str, Any] = document["nodes"][0]
         """Its node, with translation and scale."""
-        self.columns: dict[str, tuple[dict[str, Any], bytes]] = {}
-        """By attribute, an accessor without its view, and the bytes."""
+        self.columns: dict[str, tuple[dict[str, Any], int, bytes]] = {}
+        """By attribute, an accessor without its view, the distance of two values, and the bytes."""
         self.count = 0
         """Number of points."""
         if building_id not in extras["buildings"]:
@@ -87,7 +87,7 @@ class _Cut:
                 kept |= _bounds(rows, stride, accessor["componentType"])
             elif name == "_BUILDING":
                 rows = bytes(len(rows))  # it is the only one of its file
-            self.columns[name] = ({**kept, "count": self.count, "byteStride": stride}, rows)
+            self.columns[name] = ({**kept, "count": self.count}, stride, rows)
 
 
 def _bounds(rows: bytes, stride: int, component: int) -> dict[str, list[float]]:
@@ -102,43 +102,24 @@ def _bounds(rows: bytes, stride: int, component: int) -> dict[str, list[float]]:
 
 def _united(building_id: str, cuts: Iterable[_Cut], place: Mapping[str, Any]) -> bytes:
     """One file of all cuts, in their order; its origin is that of the first one."""
+    file = GlbFile()
     nodes: list[dict[str, Any]] = []
     meshes: list[dict[str, Any]] = []
-    accessors: list[dict[str, Any]] = []
-    views: list[dict[str, Any]] = []
-    pieces: list[bytes] = []
-    size = 0
     origin_m: list[int] = []
     for cut in cuts:
         origin_m = origin_m or cut.origin_m
         east, north, up = (own - first for own, first in zip(cut.origin_m, origin_m, strict=True))
         x, y, z = cut.node["translation"]
         attributes = {}
-        for name, (accessor, rows) in cut.columns.items():
-            stride = accessor.pop("byteStride")
-            attributes[name] = len(accessors)
-            accessors.append({"bufferView": len(views), **accessor})
-            span = {"buffer": 0, "byteOffset": size, "byteLength": len(rows)}
-            views.append({**span, "byteStride": stride, "target": VERTICES})
-            pieces.append(rows)
-            size += len(rows)
+        for name, (accessor, stride, rows) in cut.columns.items():
+            attributes[name] = file.accessor(file.view(rows, byteStride=stride, target=VERTICES), **accessor)
         nodes.append({**cut.node, "mesh": len(meshes), "translation": [x + east, y + up, z - north]})
         extras = {"points": cut.count, "buildings": [building_id]}
         meshes.append({"primitives": [{"attributes": attributes, "mode": 0}], "extras": extras})
-    document = {
-        "asset": {
-            "version": VERSION,
-            "generator": "gablework",
-            "extras": {"title": f"points of building {building_id}", "origin_m": origin_m, **place},
-        },
-        "extensionsUsed": [QUANTIZATION],
-        "extensionsRequired": [QUANTIZATION],
-        "scene": 0,
-        "scenes": [{"nodes": list(range(len(nodes)))}],
-        "nodes": nodes,
-        "meshes": meshes,
-        "accessors": accessors,
-        "bufferViews": views,
-        "buffers": [{"byteLength": size}],
-    }
-    return container(document, pieces)
+    return file.content(
+        nodes,
+        meshes,
+        scene={"nodes": list(range(len(nodes)))},
+        asset={"extras": {"title": f"points of building {building_id}", "origin_m": origin_m, **place}},
+        used=[QUANTIZATION],
+    )

@@ -10,15 +10,17 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.extras.octree.point_octree import OctreeNode
+from pipeline.export.tileset import node_entry, tileset_bytes
 from pipeline.model import FloatArray, IntArray
+
+if TYPE_CHECKING:
+    from pipeline.extras.octree.point_octree import OctreeNode
 
 ERROR_SPACINGS = 4.0
 """The geometric error of a node in spacings of its points. A viewer refines a tile whose error covers 16 pixels by
@@ -64,17 +66,14 @@ def tile_tileset(nodes: Sequence[OctreeNode], extras: Mapping[str, Any]) -> byte
     """The tileset of one octree, whose coordinates are about its own origin; `extras` say where that is."""
     entries: dict[str, dict[str, Any]] = {}
     for node in nodes:
-        entry: dict[str, Any] = {
-            "boundingVolume": {"box": _box(_corners(node.low_mm, node.high_mm))},
-            "geometricError": node_error_m(node.spacing_m),
-            "content": {"uri": f"{node.path}.glb"},
-            "extras": {"points": len(node.index)},
-        }
+        box = _box(_corners(node.low_mm, node.high_mm))
+        entry = node_entry(
+            {"box": box}, node_error_m(node.spacing_m), uri=f"{node.path}.glb", extras={"points": len(node.index)}
+        )
         entries[node.path] = entry
         if node.parent:
             entries[node.parent].setdefault("children", []).append(entry)
-    root = {"refine": "ADD", **entries[nodes[0].path]}
-    return _document(root, extras)
+    return _whole(entries[nodes[0].path], extras)
 
 
 def root_tileset(root: TilesetNode, extras: Mapping[str, Any], to_globe: ToGlobe | None = None) -> bytes | None:
@@ -87,7 +86,7 @@ def root_tileset(root: TilesetNode, extras: Mapping[str, Any], to_globe: ToGlobe
         entry, _ = _entry(root, frames, None)
     except _NowhereError:
         return None
-    return _document({"refine": "ADD", **entry}, extras)
+    return _whole(entry, extras)
 
 
 class _NowhereError(Exception):
@@ -136,15 +135,14 @@ def _entry(node: TilesetNode, frames: _Local | _Globe, parent: FloatArray | None
     together = np.vstack((own, *(_moved(corners, inverse) for _, corners in below)))
     low, high = together.min(axis=0), together.max(axis=0)
     box = np.array(list(itertools.product(*zip(low.tolist(), high.tolist(), strict=True))))
-    entry: dict[str, Any] = {"boundingVolume": {"box": _box(together)}, "geometricError": node.error_m}
-    relative = matrix if parent is None else np.linalg.inv(parent) @ matrix
-    if not np.array_equal(relative, np.eye(4)):
-        entry["transform"] = relative.T.reshape(-1).tolist()
-    if node.uri is not None:
-        entry["content"] = {"uri": node.uri}
-        entry["extras"] = {"points": node.points}
-    if below:
-        entry["children"] = [child for child, _ in below]
+    entry = node_entry(
+        {"box": _box(together)},
+        node.error_m,
+        transform=matrix if parent is None else np.linalg.inv(parent) @ matrix,
+        uri=node.uri,
+        extras=None if node.uri is None else {"points": node.points},
+        children=[child for child, _ in below],
+    )
     return entry, _moved(box, matrix)
 
 
@@ -169,14 +167,8 @@ def _box(xyz: FloatArray) -> list[float]:
     return [round(float(value), 4) for value in values]
 
 
-def _document(root: Mapping[str, Any], extras: Mapping[str, Any]) -> bytes:
+def _whole(root: dict[str, Any], extras: Mapping[str, Any]) -> bytes:
     """A tileset; the error of showing nothing is the size of its box."""
-    box = root["boundingVolume"]["box"]
-    size = 2.0 * math.hypot(*box[3:])
-    document = {
-        "asset": {"version": "1.1"},
-        "geometricError": round(max(size, root["geometricError"]), 3),
-        "root": root,
-        "extras": dict(extras),
-    }
-    return json.dumps(document, separators=(",", ":"), ensure_ascii=False, allow_nan=False).encode()
+    size = 2.0 * math.hypot(*root["boundingVolume"]["box"][3:])
+    error_m = round(max(size, root["geometricError"]), 3)
+    return tileset_bytes({"version": "1.1"}, error_m, "ADD", root, extras=dict(extras))

@@ -1,4 +1,4 @@
-"""Common to the recipes that triangulate a building: the extent of a TIN, and the terrain beside the building."""
+"""Shared by the recipes that triangulate a building: the extent of a TIN, and the terrain beside the building."""
 
 from __future__ import annotations
 

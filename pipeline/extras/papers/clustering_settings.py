@@ -10,7 +10,7 @@ class FuzzySartClusteringSettings(Parameters):
 
     vectors: str = parameter(
         "unit_normal",
-        "What of a facet is clustered: its unit normal, the foot of the perpendicular from the building's centre, "
+        "Clustered vector of a facet: its unit normal, the foot of the perpendicular from the building's centre, "
         "or that foot in spherical coordinates scaled to one range.",
         choices=("unit_normal", "footpoint", "spherical_scaled"),
     )
@@ -60,7 +60,7 @@ class NormalClusteringSettings(Parameters):
         maximum=100.0,
     )
     one_cluster_silhouette: float = parameter(
-        0.6, "What counts as the silhouette of a single cluster, which has none.", minimum=-1.0, maximum=1.0
+        0.6, "Value that counts as the silhouette of a single cluster, which has none.", minimum=-1.0, maximum=1.0
     )
     facet_weights: str = parameter(
         "area", "Whether large facets count more in the centres of clusters.", choices=("area", "equal")
@@ -151,8 +151,8 @@ class ClusterMembershipSettings(Parameters):
     )
     typical_o_range_m: float = parameter(
         2.0,
-        "Range of the O-distance of a typical roof face: a quarter of it counts as a standard deviation, to which that "
-        "of the mean cluster is added.",
+        "Range of the O-distance of a typical roof face: a quarter of it counts as a standard deviation, to which "
+        "the mean cluster's is added.",
         unit="m",
         minimum=0.01,
         maximum=100.0,

@@ -1,4 +1,4 @@
-"""Clusters of the facets of a TIN: their connected parts, and the points that their facets hold."""
+"""Clusters of the facets of a TIN: their connected parts and their points."""
 
 from __future__ import annotations
 

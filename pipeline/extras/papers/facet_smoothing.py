@@ -1,7 +1,7 @@
-"""Normals of facets averaged over their surroundings in the TIN: small facets of a noisy cloud point anywhere.
+"""Averages the normals of facets over their surroundings in the TIN: small facets of a noisy cloud point anywhere.
 
-The area vectors of facets that hang together add up to that of the whole patch, which depends on its border alone. So
-the sum over a patch is the patch's own mean normal, known the better the wider it is, and not a mean of noisy angles.
+The area vectors of connected facets add up to the vector of the whole patch, which depends on its border alone. So the
+sum over a patch is its own mean normal, the more certain the wider the patch is, and not a mean of noisy angles.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 The order of the steps is the paper's: TIN by greedy insertion with absorption of noise (3.1), clustering of the facets
 (3.2), best-fit planes, merging, absorption of outliers and straight ridges (3.3). The defaults are the form that
-measured better (unit normals, thresholds that follow the noise, clusters split where they do not hang together);
+measured better (unit normals, thresholds that follow the noise, clusters split into connected parts);
 `FuzzySartSettings.faithful` is the paper to the letter, as far as it is printed.
 """
 

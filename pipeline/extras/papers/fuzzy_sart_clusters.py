@@ -1,9 +1,9 @@
 """Fuzzy SART clustering of facet vectors (Shorter and Kasparis, section 3.2; Baraldi and Parmiggiani 1997).
 
-The paper prints the vector degree of match (Eqs. 3 to 6), the centring (Eq. 7), the two user parameters
-(vigilance and tau) and that all dimensions are scaled to one range. It prints no rule of learning, and none of
-the public texts on Fuzzy SART does. What is below is therefore a deterministic *reconstruction* from what those
-texts say in words: soft-to-hard competitive learning, neurons made example by example, removed a mini-batch.
+The paper prints the vector degree of match (Eqs. 3 to 6), the centring (Eq. 7), the two user parameters (vigilance and
+tau) and that all dimensions are scaled to one range. It prints no rule of learning, and none of the public texts on
+Fuzzy SART does. This module is therefore a deterministic *reconstruction* from the words of those texts: soft-to-hard
+competitive learning, with neurons made per example and removed per mini-batch.
 """
 
 from __future__ import annotations

@@ -1,12 +1,12 @@
 """K-means of facet normals with the cosine as similarity (Zeng, Lai, Li, Mao and Liu 2008, section 2.1).
 
-The facets of a TIN over one roof plane have alike normals, those over another plane different ones: k-means with "the
-cosine of [the] angle between normal vectors" groups them. The centre of a cluster is the direction of the sum of its
-normals, which is what maximises the sum of cosines, so every round lowers the inertia, the sum of 1 - cosine.
+The facets of a TIN over one roof plane have similar normals, facets over another plane different ones: k-means with
+"the cosine of [the] angle between normal vectors" groups them. The centre of a cluster is the direction of the sum of
+its normals, which is what maximises the sum of cosines, so every round lowers the inertia, the sum of 1 - cosine.
 
 The paper states neither the start nor the number of clusters. Here the start is deterministic, and the silhouette
 judges the number: with the cosine distance the mean distance of a facet to a whole cluster is one minus its product
-with the mean normal, so the silhouette is exact at the cost of one product a facet and cluster.
+with the mean normal, so the silhouette is exact at the cost of one product per facet and cluster.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Building primitives: whole forms that a method fits to a building, roof faces in plan and the planes over them.
 
-The gable of ten vertices and fifteen parameters is that of Zeng, Lai, Li, Mao and Liu (2008), section 2.4; the boxes of
+The gable of ten vertices and fifteen parameters comes from Zeng, Lai, Li, Mao and Liu (2008), section 2.4; the boxes of
 eight vertices are its counterparts for buildings of one roof plane.
 """
 

@@ -1,4 +1,4 @@
-"""From rough clusters of points to roof planes: the end that Fuzzy SART and the robust form of k-means have in common.
+"""From rough clusters of points to roof planes: the last steps of Fuzzy SART and of the robust form of k-means.
 
 Best-fit planes, merging and reassignment; then once more with clusters that grow among the points that no plane
 explains; at last straight ridges (Shorter and Kasparis, section 3.3).

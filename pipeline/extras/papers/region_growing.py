@@ -1,8 +1,8 @@
 """Points of roof faces by region growing from the mean of clusters (the outlook of Hofmann et al. 2003, section 5).
 
 A region starts where the neighbourhood of a point fits the mean direction of its cluster best, and grows over nearest
-neighbours that lie near the running plane and do not stand alone there. What a cluster holds in several places, as the
-parallel faces of two roofs, becomes several regions.
+neighbours that lie near the running plane and are not isolated. If a cluster has points in several places, such as the
+parallel faces of two roofs, they become several regions.
 """
 
 from __future__ import annotations

@@ -125,7 +125,7 @@ class ParameterSpaceSettings(RoofFaceSettings, RegionGrowingSettings, RoofTreeSe
     )
     point_groups: str = parameter(
         "region_growing",
-        "Points of a roof face: those of the facets that are members of a cluster, or a region grown from its mean.",
+        "Points of a roof face: the points of a cluster's facets, or a region grown from its mean.",
         choices=("membership", "region_growing"),
     )
     growing_vote: float = parameter(
@@ -143,7 +143,7 @@ class ParameterSpaceSettings(RoofFaceSettings, RegionGrowingSettings, RoofTreeSe
     )
     type_from: str = parameter(
         "faces",
-        "What names the roof type: the paper's decision tree, or the rule over the delivered faces.",
+        "Source of the roof type: the paper's decision tree, or the rule over the delivered faces.",
         choices=("tree", "faces"),
     )
 
@@ -270,7 +270,9 @@ class KMeansSettings(RoofFaceSettings, NormalClusteringSettings, PlaneRefinement
         minimum=0.0,
         maximum=1.0,
     )
-    fill_gap_spacings: float = parameter(1.2, "What near means, in mean point spacings.", minimum=0.1, maximum=10.0)
+    fill_gap_spacings: float = parameter(
+        1.2, "Distance that counts as near, in mean point spacings.", minimum=0.1, maximum=10.0
+    )
 
     @classmethod
     def faithful(cls) -> KMeansSettings:

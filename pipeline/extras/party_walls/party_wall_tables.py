@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pipeline.export.columns import COUNT, FLOAT64, HORIZONTAL, INT32, NONE, TEXT, WKB, Column
-from pipeline.export.result_file import ResultFile
+from pipeline.export.result_file import ResultTable
 
 FACTS = "gablework_party_walls"
 """The key of the files' metadata that holds the tolerances, as JSON."""
@@ -54,15 +54,5 @@ BUILDINGS = (
 """The columns of the buildings with a model, in the order of the file; `bbox` follows."""
 
 
-class PartyWallFile(ResultFile):
-    """The file of the pairs, while it is being written."""
-
-    columns = WALLS
-    facts_key = FACTS
-
-
-class WallAreaFile(ResultFile):
-    """The file of the buildings, while it is being written."""
-
-    columns = BUILDINGS
-    facts_key = FACTS
+TABLES = (ResultTable(WALLS, FACTS), ResultTable(BUILDINGS, FACTS))
+"""The tables of the pairs and of the buildings."""

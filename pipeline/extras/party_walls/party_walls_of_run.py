@@ -6,7 +6,6 @@ import contextlib
 import dataclasses
 import functools
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,22 +13,12 @@ import shapely
 
 from pipeline.errors import SettingsError
 from pipeline.export.coordinates import decimals
-from pipeline.export.result_file import SUFFIX
+from pipeline.export.result_file import SUFFIX, ResultFile
 from pipeline.export.solid_geometry import SURFACES
 from pipeline.extras.party_walls.contacts import ROUNDED_M, Contacts, Walls, contacts, wall_areas
-from pipeline.extras.party_walls.party_wall_tables import PartyWallFile, WallAreaFile
+from pipeline.extras.party_walls.party_wall_tables import TABLES
 from pipeline.extras.party_walls.settings import PartyWallSettings
-from pipeline.extras.publish.publishing import (
-    Published,
-    check_complete,
-    disk_at,
-    facts_of,
-    file_outside,
-    finished_run,
-    refuse_existing,
-    stated_files,
-)
-from pipeline.io import LocalStorage
+from pipeline.extras.publish.finished_run import FinishedRun, Published, file_outside, new_file
 from pipeline.model import BoolArray, FaceKind
 from pipeline.runtime.manifest import RunManifest
 from pipeline.runtime.monitoring.progress import Event, Listener, ignore
@@ -51,57 +40,35 @@ def party_walls(  # each is an option of the command
 ) -> Published:
     """Write which walls of which buildings of a finished run touch, as GeoParquet.
 
-    The files appear whole, or stay what they were.
-
-    Raises SettingsError if `out` or `buildings` cannot be such a file, and RunError if one exists, if the run is not
-    finished, changes meanwhile or lacks files, or if something cannot be read or written.
+    The other parameters and errors are as in `publishing.Form`.
 
     Parameters
     ----------
-    run_dir : str
-        The run directory, a folder or a URL.
-    out : str
-        The file of the pairs of walls, a path of this machine that ends in .parquet.
     buildings : str, optional
-        The file of the wall areas of each building, likewise.
+        The file of the wall areas of each building; `out` is that of the pairs of walls.
     settings : PartyWallSettings, optional
         When two walls touch.
-    overwrite : bool
-        Replace existing files.
-    on_event : callable
-        Gets progress: tiles.
     """
     settings = settings or PartyWallSettings()
-    targets = [file_outside(run_dir, name, "the table is", SUFFIX) for name in (out, buildings) if name is not None]
+    targets = [file_outside(run_dir, name, SUFFIX, overwrite) for name in (out, buildings) if name is not None]
     if len(set(targets)) < len(targets):
         raise SettingsError([f"--out and --buildings are both {targets[0]}: give two files"])
-    for target in targets:
-        refuse_existing(target, overwrite)
-    manifest = finished_run(run_dir)
-    stated = stated_files(run_dir, {_TABLE})
-    run = _Run(run_dir, manifest)
-    facts = {**facts_of(manifest), **dataclasses.asdict(settings)}
+    finished = FinishedRun.at(run_dir, {_TABLE})
+    run = _Run(run_dir, finished.manifest)
+    facts = {**finished.facts, **dataclasses.asdict(settings)}
     with contextlib.ExitStack() as stack:
-        kinds = (PartyWallFile, WallAreaFile)
+        places = [stack.enter_context(new_file(target, overwrite)) for target in targets]
         files = [
-            stack.enter_context(kind(_temporary(stack, target), run.reference.projjson, facts))
-            for kind, target in zip(kinds, targets, strict=False)
+            stack.enter_context(ResultFile(table, place, run.reference.projjson, facts))
+            for table, place in zip(TABLES, places, strict=False)
         ]
         for done, tile in enumerate(run.tiles, start=1):
             _write_tile(files, run, tile, settings)
             on_event(Event(kind="progress", stage="party walls", done=done, total=len(run.tiles)))
-        check_complete(run_dir, manifest, {}, stated)
-        for target in targets:
-            refuse_existing(target, overwrite)
+        finished.check({})
     rows = dict(zip(("party_walls", "buildings"), (file.rows for file in files), strict=False))
     size = sum(target.stat().st_size for target in targets)
     return Published(place=", ".join(map(str, targets)), size_bytes=size, rows=rows)
-
-
-def _temporary(stack: contextlib.ExitStack, target: Path) -> Path:
-    """A file beside the target that takes its name when the stack ends well."""
-    stack.enter_context(disk_at(target))
-    return stack.enter_context(LocalStorage(root=target.parent).putting(target.name))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -153,7 +120,7 @@ def _joined(lists: list[list[Any]], kind: type) -> Any:
     return np.array([value for one in lists for value in one], dtype=kind)
 
 
-def _write_tile(files: list[Any], run: _Run, tile: str, settings: PartyWallSettings) -> None:
+def _write_tile(files: list[ResultFile], run: _Run, tile: str, settings: PartyWallSettings) -> None:
     """Add the rows of a tile to the files: the pairs, and the buildings if they are wanted."""
     own = run.tile(tile)
     if not len(own.ids):
@@ -169,7 +136,7 @@ def _write_tile(files: list[Any], run: _Run, tile: str, settings: PartyWallSetti
         _write_buildings(file, tile, own, walls, found)
 
 
-def _write_pairs(file: PartyWallFile, run: _Run, tile: str, walls: Walls, found: Contacts, is_own: BoolArray) -> None:
+def _write_pairs(file: ResultFile, run: _Run, tile: str, walls: Walls, found: Contacts, is_own: BoolArray) -> None:
     """Add the pairs of different buildings of which the first is of the tile: so each pair is written once."""
     a, b = walls.building[found.first], walls.building[found.second]
     kept = np.flatnonzero(is_own[found.first] & (a != b))
@@ -196,7 +163,7 @@ def _write_pairs(file: PartyWallFile, run: _Run, tile: str, walls: Walls, found:
     file.write(columns, shapes)
 
 
-def _write_buildings(file: WallAreaFile, tile: str, own: _Tile, walls: Walls, found: Contacts) -> None:
+def _write_buildings(file: ResultFile, tile: str, own: _Tile, walls: Walls, found: Contacts) -> None:
     """Add the wall areas of the buildings of a tile."""
     areas = wall_areas(walls, found)
     order = np.argsort(own.ids)

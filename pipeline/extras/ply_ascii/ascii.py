@@ -11,16 +11,16 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from pipeline.errors import EmptyInputError, InconsistentInputError, SettingsError, UnreadableInputError
 from pipeline.extras.ply_ascii.ascii_names import COMMENT, SEPARATORS, columns_of, header_columns, is_complete
-from pipeline.io.gps_time import GpsTimeKind, kind_of
+from pipeline.extras.ply_ascii.measuring import measured, whole
 from pipeline.io.reading import moved
-from pipeline.io.records import UNSORTED_CLASSES, FileFacts, PointRecords, Readable, Window
-from pipeline.io.strays import thinned, typical_bounds
+from pipeline.io.records import FileFacts, PointRecords, Readable, Window
 from pipeline.model import FloatArray
 
 SAMPLE_ROWS = 20_000
@@ -47,7 +47,7 @@ class AsciiFile:
 
     Parameters
     ----------
-    columns : str, optional
+    ascii_columns : str, optional
         Names of the columns, parted by spaces, such as `x y z - classification` or `x1 y1 z1 i1 x2 y2 z2 i2`;
         None to find out.
     facts : FileFacts, optional
@@ -63,15 +63,15 @@ class AsciiFile:
         If the columns do not fit the rows.
     """
 
-    def __init__(self, path: Readable, columns: str | None = None, facts: FileFacts | None = None) -> None:
+    def __init__(self, path: Readable, ascii_columns: str | None = None, facts: FileFacts | None = None) -> None:
         self._path = path
         self._width = 0
         self._separator: str | None = None
         self._promised: int | None = None
         self._header_lines, header, sample = self._look(path)
-        self._columns = self._choose(columns, header, sample)
+        self._columns = self._choose(ascii_columns, header, sample)
         self._is_pairs = "x2" in self._columns
-        self.facts = self._measure(sample) if facts is None else facts
+        self.facts = self._measure() if facts is None else facts
 
     def records(self, chunk_size: int, window: Window | None) -> Iterator[PointRecords]:
         """The records in file order; of a row with two echoes the first before the last."""
@@ -183,8 +183,8 @@ class AsciiFile:
         """One point a row."""
         at = self._columns
 
-        def small(name: str) -> npt.NDArray[np.uint8] | None:
-            return np.clip(rows[:, at[name]], 0, 255).astype(np.uint8) if name in at else None
+        def small(name: str, dtype: type[np.integer[Any]] = np.uint8) -> npt.NDArray[Any] | None:
+            return whole(rows[:, at[name]], dtype) if name in at else None
 
         return PointRecords(
             xyz=np.ascontiguousarray(rows[:, [at["x"], at["y"], at["z"]]]),
@@ -192,7 +192,7 @@ class AsciiFile:
             return_count=small("return_count"),
             classification=small("classification"),
             gps_time=np.ascontiguousarray(rows[:, at["gps_time"]]) if "gps_time" in at else None,
-            source_id=np.clip(rows[:, at["source_id"]], 0, 65535).astype(np.uint16) if "source_id" in at else None,
+            source_id=small("source_id", np.uint16),
         )
 
     def _pulses(self, rows: FloatArray) -> PointRecords:
@@ -207,45 +207,24 @@ class AsciiFile:
         xyz = np.stack((first, last), axis=1).reshape(-1, 3)
         return PointRecords(xyz=xyz[keep], return_number=number[keep], return_count=count[keep])
 
-    def _measure(self, sample: FloatArray) -> FileFacts:
-        """Count and bounds by a pass over the file; classes and times from the sample."""
-        low, high, count, has_returns = np.full(3, np.inf), np.full(3, -np.inf), 0, False
-        places = []
-        for piece in self.records(100_000, None):
-            count += len(piece)
-            places.append(thinned(piece.xyz))
-            low, high = np.minimum(low, piece.xyz.min(axis=0)), np.maximum(high, piece.xyz.max(axis=0))
-            has_returns = has_returns or (piece.return_count is not None and bool((piece.return_count > 1).any()))
-        if count == 0:
+    def _measure(self) -> FileFacts:
+        """What a pass over the file finds."""
+        at, pulses = self._columns, "rows hold the first and last echo of a pulse, read as two returns"
+        facts = measured(
+            "ascii",
+            self.records(100_000, None),
+            dimensions=tuple((name, "f8") for name in sorted(at, key=at.__getitem__) if name not in {"x2", "y2", "z2"}),
+            warnings=(pulses,) if self._is_pairs else (),
+        )
+        if facts is None:
             raise EmptyInputError(str(self._path), "the file holds no rows of points", "Give a file with points")
-        if self._promised not in {None, count}:
+        if self._promised not in {None, facts.point_count}:
             raise InconsistentInputError(
                 str(self._path),
-                f"the first line promises {self._promised} points, there are {count}",
+                f"the first line promises {self._promised} points, there are {facts.point_count}",
                 "Get the file again",
             )
-        at, kind, times = self._columns, GpsTimeKind.NONE, None
-        if "gps_time" in at:
-            times = float(sample[:, at["gps_time"]].min()), float(sample[:, at["gps_time"]].max())
-            kind = kind_of(*times, flagged_as_adjusted=False)
-        classified = "classification" in at and not bool(
-            np.isin(sample[:, at["classification"]], UNSORTED_CLASSES).all()
-        )
-        warnings = ("rows hold the first and last echo of a pulse, read as two returns",) if self._is_pairs else ()
-        x_min, y_min, z_min, x_max, y_max, z_max = (float(value) for value in (*low, *high))
-        return FileFacts(
-            format="ascii",
-            point_count=count,
-            bounds=(x_min, y_min, z_min, x_max, y_max, z_max),
-            has_returns=has_returns,
-            has_classes=classified,
-            has_gps_time=kind is not GpsTimeKind.NONE,
-            gps_time_kind=kind,
-            gps_time_range=None if kind is GpsTimeKind.NONE else times,
-            typical_bounds=typical_bounds(places),
-            dimensions=tuple((name, "f8") for name in sorted(at, key=at.__getitem__) if name not in {"x2", "y2", "z2"}),
-            warnings=warnings,
-        )
+        return facts
 
 
 def looks_like_pulses(first: FloatArray, last: FloatArray) -> bool:

@@ -15,10 +15,9 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.errors import EmptyInputError, InconsistentInputError, UnreadableInputError
-from pipeline.io.gps_time import GpsTimeKind, kind_of
+from pipeline.extras.ply_ascii.measuring import measured, whole
 from pipeline.io.reading import moved
-from pipeline.io.records import UNSORTED_CLASSES, FileFacts, PointRecords, Readable, Window
-from pipeline.io.strays import thinned, typical_bounds
+from pipeline.io.records import FileFacts, PointRecords, Readable, Window
 
 SCALARS = {
     "char": "i1",
@@ -200,55 +199,27 @@ class PlyFile:
     def _to_records(self, table: npt.NDArray[np.void]) -> PointRecords:
         """Arrays of the fields that are used."""
 
-        def whole(field: str, dtype: type[np.integer[Any]]) -> npt.NDArray[Any] | None:
-            if field not in self._fields:
-                return None
-            values = np.nan_to_num(table[self._fields[field]].astype(np.float64))
-            return np.clip(values, 0, np.iinfo(dtype).max).astype(dtype)
+        def small(field: str, dtype: type[np.integer[Any]]) -> npt.NDArray[Any] | None:
+            return whole(table[self._fields[field]].astype(np.float64), dtype) if field in self._fields else None
 
         xyz = np.column_stack([table[axis].astype(np.float64) for axis in "xyz"])
         time = self._fields.get("gps_time")
         return PointRecords(
             xyz=xyz,
-            return_number=whole("return_number", np.uint8),
-            return_count=whole("return_count", np.uint8),
-            classification=whole("classification", np.uint8),
+            return_number=small("return_number", np.uint8),
+            return_count=small("return_count", np.uint8),
+            classification=small("classification", np.uint8),
             gps_time=None if time is None else table[time].astype(np.float64),
-            source_id=whole("source_id", np.uint16),
+            source_id=small("source_id", np.uint16),
         )
 
     def _measure(self) -> FileFacts:
-        """Bounds, returns, classes and times by a pass over the vertices."""
-        low, high = np.full(3, np.inf), np.full(3, -np.inf)
-        earliest, latest, classified, has_returns = np.inf, -np.inf, False, False
-        sample = []
-        for piece in self.records(100_000, None):
-            low, high = np.minimum(low, piece.xyz.min(axis=0)), np.maximum(high, piece.xyz.max(axis=0))
-            sample.append(thinned(piece.xyz))
-            if piece.gps_time is not None:
-                earliest, latest = min(earliest, piece.gps_time.min()), max(latest, piece.gps_time.max())
-            if piece.classification is not None:
-                classified = classified or not np.isin(piece.classification, UNSORTED_CLASSES).all()
-            if piece.return_count is not None:
-                has_returns = has_returns or bool((piece.return_count > 1).any())
-        kind, times = GpsTimeKind.NONE, None
-        if np.isfinite([earliest, latest]).all():
-            times = float(earliest), float(latest)
-            kind = kind_of(*times, flagged_as_adjusted=False)
-        x_min, y_min, z_min, x_max, y_max, z_max = (float(value) for value in (*low, *high))
-        return FileFacts(
-            format="ply",
-            point_count=self._vertex.count,
-            bounds=(x_min, y_min, z_min, x_max, y_max, z_max),
-            has_returns=has_returns,
-            has_classes=bool(classified),
-            has_gps_time=kind is not GpsTimeKind.NONE,
-            gps_time_kind=kind,
-            gps_time_range=None if kind is GpsTimeKind.NONE else times,
-            typical_bounds=typical_bounds(sample),
-            dimensions=tuple((name, SCALARS[kind]) for name, kind in self._vertex.properties),
-            warnings=self._precision_warnings(np.maximum(np.abs(low), np.abs(high))),
-        )
+        """What a pass over the vertices finds."""
+        dimensions = tuple((name, SCALARS[kind]) for name, kind in self._vertex.properties)
+        facts = measured("ply", self.records(100_000, None), dimensions=dimensions)
+        assert facts is not None  # the header promises some, and all are there
+        bounds = np.abs(np.reshape(facts.bounds, (2, 3))).max(axis=0)
+        return dataclasses.replace(facts, warnings=self._precision_warnings(bounds))
 
     def _precision_warnings(self, largest: npt.NDArray[np.float64]) -> tuple[str, ...]:
         """Tell where single precision is too coarse for the coordinates."""

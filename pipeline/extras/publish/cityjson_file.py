@@ -3,8 +3,25 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
+
+from pipeline.errors import RunError
+from pipeline.export.cityjson import lines_of
+from pipeline.export.folders import TERRAIN_FOLDER
+from pipeline.extras.publish.finished_run import (
+    SEQUENCES,
+    FinishedRun,
+    Published,
+    new_files,
+    path_outside,
+    sequences_of,
+)
+from pipeline.io import storage_at
+from pipeline.runtime.monitoring.progress import Event, Listener, ignore
+
+SUFFIX = ".city.json"
+"""Ending of the files."""
 
 
 def city_of(*sequences: Iterable[str]) -> dict[str, Any]:
@@ -61,3 +78,34 @@ def _between(first: dict[str, Any], other: dict[str, Any]) -> list[int]:
 def _renumbered(boundaries: list[Any], places: list[int]) -> list[Any]:
     """Boundaries with other numbers of their vertices, however deep they are nested."""
     return [_renumbered(part, places) if isinstance(part, list) else places[part] for part in boundaries]
+
+
+def publish_cityjson(run_dir: str, out: str, *, overwrite: bool = False, on_event: Listener = ignore) -> Published:
+    """Write `<tile>.city.json` of each tile, with its terrain if any; parameters and errors as in `publishing.Form`."""
+    target = path_outside(run_dir, out)
+    run = FinishedRun.at(run_dir, {SEQUENCES})
+    sequences, terrains = sequences_of(run_dir), sequences_of(run_dir, TERRAIN_FOLDER)
+    keys = {
+        f"{tile}{SUFFIX}": [found[tile] for found in (sequences, terrains) if tile in found]
+        for tile in sorted({*sequences, *terrains})
+    }
+    buildings = size = 0
+    with new_files(target, overwrite, keys, lambda: target.glob(f"*{SUFFIX}")) as made:
+        for done, (name, of_tile) in enumerate(keys.items(), start=1):
+            city = _city(run_dir, of_tile)
+            buildings += sum(thing["type"] == "Building" for thing in city["CityObjects"].values())
+            content = json.dumps(city, separators=(",", ":"), ensure_ascii=False).encode()
+            made.put(name, content)
+            size += len(content)
+            on_event(Event(kind="progress", stage=SEQUENCES, done=done, total=len(keys)))
+        run.check({"buildings": buildings})
+    return Published(place=str(target), size_bytes=size, rows={"buildings": buildings})
+
+
+def _city(run_dir: str, keys: Sequence[str]) -> dict[str, Any]:
+    """The CityJSON object of the sequences of one tile; raises RunError if a file is damaged."""
+    sequences = [lines_of(storage_at(run_dir).get(key).decode()) for key in keys]
+    try:
+        return city_of(*sequences)
+    except (ValueError, KeyError, TypeError) as fault:
+        raise RunError(f"{keys[0]} of the run in {run_dir} is damaged ({str(fault)[:160]}): run it again") from fault

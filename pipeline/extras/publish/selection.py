@@ -20,11 +20,11 @@ import shapely
 from pipeline.errors import RunError
 from pipeline.export.cityjson import json_line, lines_of
 from pipeline.export.decisions import NAME as DECISIONS
-from pipeline.export.folders import put_local
+from pipeline.export.folders import TERRAIN_FOLDER, put_local
 from pipeline.export.geoparquet import geo_metadata, parquet_bytes, shape_names, stored_schema, table_batches
 from pipeline.export.glb import glb_bytes
+from pipeline.extras.publish.finished_run import check_complete, disk_at, sequences_of
 from pipeline.extras.publish.obj_parts import lines_of_buildings
-from pipeline.extras.publish.publishing import check_complete, disk_at, terrains_of
 from pipeline.io import arrow_at, storage_at
 from pipeline.io.crs import SpatialReference
 from pipeline.io.temporary import temporary_folder
@@ -86,7 +86,7 @@ def select_run(run_dir: str, out: Path, statuses: Collection[Status]) -> None:
                 put(name, content)
                 files[name] = hashlib.sha256(content).hexdigest()
             put(key, json.dumps({**state, "files": files}, indent=1).encode())
-        for name in terrains_of(run_dir).values():
+        for name in sequences_of(run_dir, TERRAIN_FOLDER).values():
             put(name, storage.get(name))
         check_complete(run_dir, manifest, {"buildings": selection.read}, [])
         counts = {**manifest.counts, **selection.counts()}

@@ -13,12 +13,12 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from shapely import Polygon
 from shapely.geometry.polygon import orient
 
-from pipeline.export.glb import MATERIALS, Frame, SolidMesh, gltf_axes, materials, record_level
-from pipeline.export.glb_container import INDICES, QUANTIZATION, VERSION, VERTICES, container
+from pipeline.export.glb import MATERIALS, Frame, SolidMesh, materials, record_level
+from pipeline.export.glb_arrays import MOST_SHORT, add_triangles, add_vertices, gltf_axes, quantized
+from pipeline.export.glb_container import QUANTIZATION, GlbFile
 from pipeline.extras.publish_3dtiles.property_table import StoredColumn
 from pipeline.model import FloatArray, IntArray
 
@@ -27,19 +27,15 @@ Geodesy = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 and to EPSG:4978 (n, 3) in metres; not finite where there is none."""
 BUILDING, ROOF_PLANE = "building", "roof_plane"
 """Labels of the sets of feature ids, and of the class of the records."""
-NO_PLANE = 65_535
+NO_PLANE = MOST_SHORT
 """Feature id of a roof without a plane: a block's."""
 SIMPLER_M = 0.5
 """How far outlines of blocks may be from those of the models; a tenth of the least error of blocks."""
-MAX_STEP_MM = 10
-"""Largest step of positions: errors stay within half of it. Wider files have 32-bit floats."""
-
 _SEMI_MAJOR_M, _ECCENTRICITY_2 = 6_378_137.0, 6.69437999014e-3
 """The ellipsoid of WGS 84."""
 _MM = 1000
 _REACH_M = 100.0
 _FEATURES, _METADATA = "EXT_mesh_features", "EXT_structural_metadata"
-_TYPES = {"|i1": 5120, "<u2": 5123, "<u4": 5125, "<f4": 5126}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -185,31 +181,24 @@ def globe_glb(buildings: Sequence[Placed], columns: Sequence[StoredColumn], matr
     """At least one building as a GLB file about the axes of `matrix`; the same buildings give the same bytes."""
     turn, origin = matrix[:3, :3], matrix[:3, 3]
     metres = gltf_axes((np.concatenate([b.geocentric for b in buildings]) - origin) @ turn)
-    away_mm = np.rint(metres * _MM).astype(np.int64)
-    low_mm = away_mm.min(axis=0)
-    away_mm -= low_mm
-    step_mm = max(1, -(-int(away_mm.max()) // NO_PLANE))
-    if step_mm <= MAX_STEP_MM:
-        positions: npt.NDArray[Any] = ((away_mm + step_mm // 2) // step_mm).astype("<u2")
-    else:
-        step_mm, positions = _MM, (away_mm / _MM).astype("<f4")
+    node, positions = quantized(np.rint(metres * _MM).astype(np.int64))
     normals = np.rint(gltf_axes(np.concatenate([b.normals for b in buildings]) @ turn) * 127.0).astype("|i1")
     planes = np.concatenate([b.planes for b in buildings])
     counts = [len(b.geocentric) for b in buildings]
     numbers = np.repeat(np.arange(len(buildings)), counts)
     starts = np.cumsum([0, *counts])
-    file = _File()
+    file = GlbFile(alignment=8)
     # all primitives share the corners: those of a building's roof and walls are near one another, as gzip needs it
     attributes = {
-        "POSITION": file.attribute(positions, "VEC3", bounded=True),
-        "NORMAL": file.attribute(normals, "VEC3", normalized=True),
-        "_FEATURE_ID_0": file.attribute(numbers.astype("<u2" if len(buildings) <= NO_PLANE else "<f4"), "SCALAR"),
+        "POSITION": add_vertices(file, positions, "VEC3", bounded=True),
+        "NORMAL": add_vertices(file, normals, "VEC3", normalized=True),
+        "_FEATURE_ID_0": add_vertices(file, numbers.astype("<u2" if len(buildings) <= NO_PLANE else "<f4"), "SCALAR"),
     }
     sets = [{"featureCount": len(buildings), "attribute": 0, "label": BUILDING, "propertyTable": 0}]
     plane_attributes, plane_sets = {}, []
     if (planes >= 0).any():
         held = np.where(planes < 0, NO_PLANE, planes)
-        plane_attributes["_FEATURE_ID_1"] = file.attribute(held.astype("<u2"), "SCALAR")
+        plane_attributes["_FEATURE_ID_1"] = add_vertices(file, held.astype("<u2"), "SCALAR")
         count = len(np.unique(planes[planes >= 0]))
         plane_sets.append({"featureCount": count, "attribute": 1, "label": ROOF_PLANE, "nullFeatureId": NO_PLANE})
     primitives = []
@@ -221,99 +210,31 @@ def globe_glb(buildings: Sequence[Placed], columns: Sequence[StoredColumn], matr
         primitives.append(
             {
                 "attributes": {**attributes, **plane_attributes} if roof else attributes,
-                "indices": file.indices(np.concatenate(parts)),
+                "indices": add_triangles(file, np.concatenate(parts)),
                 "material": list(MATERIALS).index(name),
                 "extensions": {_FEATURES: {"featureIds": [*sets, *plane_sets] if roof else sets}},
             }
         )
-    table = {"class": BUILDING, "count": len(buildings), "properties": file.columns(buildings, columns)}
-    node = {"mesh": 0, "translation": (low_mm / _MM).tolist(), "scale": [step_mm / _MM] * 3}
-    return file.content(node, primitives, table, columns)
+    table = {"class": BUILDING, "count": len(buildings), "properties": _properties(file, buildings, columns)}
+    classes = {BUILDING: {"properties": {column.name: column.definition for column in columns}}}
+    return file.content(
+        [{"mesh": 0, **node}],
+        [{"primitives": primitives}],
+        materials=materials(()),
+        used=(QUANTIZATION, _FEATURES, _METADATA),
+        extensions={_METADATA: {"schema": {"id": "gablework", "classes": classes}, "propertyTables": [table]}},
+    )
 
 
-class _File:
-    """The accessors, views and bytes of a file.
-
-    Each view begins at a multiple of eight bytes, as numbers of 64 bits need it.
-    """
-
-    def __init__(self) -> None:
-        self.accessors: list[dict[str, Any]] = []
-        self.views: list[dict[str, Any]] = []
-        self.pieces: list[bytes] = []
-        self.size = 0
-
-    def attribute(self, values: npt.NDArray[Any], kind: str, *, bounded: bool = False, normalized: bool = False) -> int:
-        """Append values of vertices, (n,) or (n, 3), each at a multiple of four bytes; the number of their accessor."""
-        columns = values.reshape(len(values), -1)
-        width = -(-columns.shape[1] * columns.itemsize // 4) * 4 // columns.itemsize
-        wide = np.zeros((len(columns), width), columns.dtype)
-        wide[:, : columns.shape[1]] = columns
-        more: dict[str, Any] = {"normalized": True} if normalized else {}
-        if bounded:
-            more |= {"min": columns.min(axis=0).tolist(), "max": columns.max(axis=0).tolist()}
-        view = self._view(wide.tobytes(), byteStride=wide.strides[0], target=VERTICES)
-        return self._accessor(view, columns, kind, more)
-
-    def indices(self, index: IntArray) -> int:
-        """Append triangles (t, 3); the number of their accessor."""
-        values = index.reshape(-1).astype("<u2" if index.max() < NO_PLANE else "<u4")
-        return self._accessor(self._view(values.tobytes(), target=INDICES), values, "SCALAR", {})
-
-    def columns(self, buildings: Sequence[Placed], columns: Sequence[StoredColumn]) -> dict[str, Any]:
-        """Append the columns of a property table that have values; its properties."""
-        found = {}
-        for column in columns:
-            values = [building.record[column.name] for building in buildings]
-            if all(value is None for value in values):
-                continue
-            data, offsets = column.stored(values)
-            found[column.name] = {"values": self._view(data or b"\0")}
-            if offsets is not None:
-                found[column.name]["stringOffsets"] = self._view(offsets)
-        return found
-
-    def content(
-        self,
-        node: Mapping[str, Any],
-        primitives: Sequence[Mapping[str, Any]],
-        table: Mapping[str, Any],
-        columns: Sequence[StoredColumn],
-    ) -> bytes:
-        """The whole file."""
-        document = {
-            "asset": {"version": VERSION, "generator": "gablework"},
-            "extensionsUsed": [QUANTIZATION, _FEATURES, _METADATA],
-            "extensionsRequired": [QUANTIZATION],
-            "extensions": {
-                _METADATA: {
-                    "schema": {
-                        "id": "gablework",
-                        "classes": {BUILDING: {"properties": {c.name: c.definition for c in columns}}},
-                    },
-                    "propertyTables": [table],
-                }
-            },
-            "scene": 0,
-            "scenes": [{"nodes": [0]}],
-            "nodes": [node],
-            "meshes": [{"primitives": primitives}],
-            "materials": materials(()),
-            "accessors": self.accessors,
-            "bufferViews": self.views,
-            "buffers": [{"byteLength": self.size}],
-        }
-        return container(document, self.pieces, alignment=8)
-
-    def _accessor(self, view: int, values: npt.NDArray[Any], kind: str, more: Mapping[str, Any]) -> int:
-        self.accessors.append(
-            {"bufferView": view, "componentType": _TYPES[values.dtype.str], "count": len(values), "type": kind, **more}
-        )
-        return len(self.accessors) - 1
-
-    def _view(self, data: bytes, **more: int) -> int:
-        self.views.append({"buffer": 0, "byteOffset": self.size, "byteLength": len(data), **more})
-        padded = data + b"\0" * (-len(data) % 8)
-        self.pieces.append(padded)
-        self.size += len(padded)
-        return len(self.views) - 1
+def _properties(file: GlbFile, buildings: Sequence[Placed], columns: Sequence[StoredColumn]) -> dict[str, Any]:
+    """Append the columns of a property table that have values; its properties."""
+    found = {}
+    for column in columns:
+        values = [building.record[column.name] for building in buildings]
+        if all(value is None for value in values):
+            continue
+        data, offsets = column.stored(values)
+        found[column.name] = {"values": file.view(data or b"\0")}
+        if offsets is not None:
+            found[column.name]["stringOffsets"] = file.view(offsets)
+    return found

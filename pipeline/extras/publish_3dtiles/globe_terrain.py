@@ -7,12 +7,12 @@ neighbouring files meet, and the terrain meets the floors of the buildings as ne
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
 import numpy as np
 
-from pipeline.export.glb import gltf_axes, material
-from pipeline.export.glb_container import INDICES, QUANTIZATION, VERSION, VERTICES, container
+from pipeline.export.glb import material
+from pipeline.export.glb_arrays import add_triangles, add_vertices, gltf_axes
+from pipeline.export.glb_container import QUANTIZATION, VERTICES, GlbFile
 from pipeline.extras.publish_3dtiles.globe_glb import Geodesy
 from pipeline.model import FloatArray, LabelArray
 
@@ -20,9 +20,6 @@ NAME = "Terrain"
 """Name of the material."""
 COLOUR = (0.32, 0.35, 0.22)
 """Its colour in linear RGB."""
-_MOST_SHORT = 65_535
-"""Most vertices that numbers of 16 bits can name; the largest number restarts a primitive."""
-_BYTE, _UNSIGNED_SHORT, _UNSIGNED_INT, _FLOAT = 5120, 5123, 5125, 5126
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -51,45 +48,20 @@ def terrain_glb(terrain: PlacedTerrain, matrix: FloatArray) -> bytes:
     """A GLB file about the axes of `matrix`, (4, 4) to EPSG:4978; the same terrain gives the same bytes."""
     turn, origin = matrix[:3, :3], matrix[:3, 3]
     metres = gltf_axes((terrain.geocentric - origin) @ turn)
-    positions = metres.astype("<f4")
     normals = np.zeros((len(metres), 4), "|i1")  # each at a multiple of four bytes
     normals[:, :3] = np.rint(_normals(metres, terrain.triangles) * 127.0)
-    is_short = len(metres) <= _MOST_SHORT
-    index = terrain.triangles.astype("<u2" if is_short else "<u4")
-    pieces = [positions.tobytes(), normals.tobytes(), index.tobytes()]
-    starts = np.cumsum([0, *map(len, pieces)]).tolist()
-    views: list[dict[str, Any]] = [
-        {"buffer": 0, "byteOffset": start, "byteLength": len(piece)}
-        for start, piece in zip(starts, pieces, strict=False)
-    ]
-    views[0] |= {"byteStride": 12, "target": VERTICES}
-    views[1] |= {"byteStride": 4, "target": VERTICES}
-    views[2] |= {"target": INDICES}
-    bounds = {"min": positions.min(axis=0).tolist(), "max": positions.max(axis=0).tolist()}
-    accessors = [
-        {"bufferView": 0, "componentType": _FLOAT, "count": len(metres), "type": "VEC3", **bounds},
-        {"bufferView": 1, "componentType": _BYTE, "normalized": True, "count": len(metres), "type": "VEC3"},
-        {
-            "bufferView": 2,
-            "componentType": _UNSIGNED_SHORT if is_short else _UNSIGNED_INT,
-            "count": index.size,
-            "type": "SCALAR",
-        },
-    ]
-    document = {
-        "asset": {"version": VERSION, "generator": "gablework"},
-        "extensionsUsed": [QUANTIZATION],
-        "extensionsRequired": [QUANTIZATION],
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "NORMAL": 1}, "indices": 2, "material": 0}]}],
-        "materials": [material(NAME, COLOUR)],
-        "accessors": accessors,
-        "bufferViews": views,
-        "buffers": [{"byteLength": starts[-1]}],
+    file = GlbFile()
+    position = add_vertices(file, metres.astype("<f4"), "VEC3", bounded=True)
+    view = file.view(normals.tobytes(), byteStride=4, target=VERTICES)
+    normal = file.accessor(view, componentType=5120, normalized=True, count=len(metres), type="VEC3")
+    primitive = {
+        "attributes": {"POSITION": position, "NORMAL": normal},
+        "indices": add_triangles(file, terrain.triangles),
+        "material": 0,
     }
-    return container(document, pieces)
+    return file.content(
+        [{"mesh": 0}], [{"primitives": [primitive]}], materials=[material(NAME, COLOUR)], used=[QUANTIZATION]
+    )
 
 
 def _normals(metres: FloatArray, triangles: LabelArray) -> FloatArray:

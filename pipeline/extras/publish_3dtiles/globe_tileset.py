@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.export.tileset import node_entry, tileset_bytes
 from pipeline.extras.publish_3dtiles.globe_glb import Content, Placed
 from pipeline.model import FloatArray
 from pipeline.tiling import Tile
@@ -129,27 +130,29 @@ def globe_tileset(branch: Branch, extras: Mapping[str, Any]) -> bytes:
     error_m = max(size_m, *(node.error_m for node in branch.nodes))
     whole = Node(region=region, error_m=error_m, children=branch.nodes)
     root = branch.nodes[0] if len(branch.nodes) == 1 else whole
-    document = {
-        "asset": {"version": "1.1", "extras": dict(extras)},
-        "geometricError": error_m,
-        "root": {"refine": "REPLACE", **_entry(root, np.eye(4))},
-    }
-    return json.dumps(document, separators=(",", ":"), ensure_ascii=False, allow_nan=False).encode()
+    return tileset_bytes({"version": "1.1", "extras": dict(extras)}, error_m, "REPLACE", _entry(root, np.eye(4)))
 
 
 def _entry(node: Node, parent: FloatArray) -> dict[str, Any]:
     """A node as JSON, with all below it; `parent` is the matrix (4, 4) that those above it have together."""
     low, high = node.region + _MARGIN
     region = [*np.radians(low[:2]).round(10), *np.radians(high[:2]).round(10), round(low[2], 3), round(high[2], 3)]
-    found: dict[str, Any] = {
-        "boundingVolume": {"region": [float(value) for value in region]},
-        "geometricError": node.error_m,
-    }
     matrix = parent if node.matrix is None else node.matrix
-    if matrix is not parent and not np.array_equal(matrix, parent):
-        found["transform"] = (np.linalg.inv(parent) @ matrix).T.reshape(-1).tolist()
-    if node.uri is not None:
-        found["content"] = {"uri": node.uri}
-    if node.children:
-        found["children"] = [_entry(child, matrix) for child in node.children]
-    return found
+    return node_entry(
+        {"region": [float(value) for value in region]},
+        node.error_m,
+        transform=None if np.array_equal(matrix, parent) else np.linalg.inv(parent) @ matrix,
+        uri=node.uri,
+        children=[_entry(child, matrix) for child in node.children],
+    )
+
+
+def moved_tileset(content: bytes, folder: str) -> bytes:
+    """A tileset for a place above its folder."""
+    document = json.loads(content)
+    waiting = [document["root"]]
+    for node in waiting:
+        if "content" in node:
+            node["content"]["uri"] = f"{folder}/{node['content']['uri']}"
+        waiting.extend(node.get("children", ()))
+    return json.dumps(document, separators=(",", ":"), ensure_ascii=False).encode()

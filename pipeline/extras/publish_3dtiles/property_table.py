@@ -1,6 +1,6 @@
 """Records as a property table in glTF (EXT_structural_metadata): which columns it has, of which types, and their bytes.
 
-A table has the columns of the building record by the same names, without those of shapes, and `tile`. `STORED_TYPES`
+A table has the columns of the building record by the same names, without those of shapes, and `tile`. `columns.KINDS`
 says what each type of Arrow becomes. The rules are those of the extension and of the 3D Metadata Specification (OGC
 22-025r4, section 11).
 """
@@ -8,15 +8,14 @@ says what each type of Arrow becomes. The rules are those of the extension and o
 from __future__ import annotations
 
 import dataclasses
-import datetime as dt
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
 from pipeline.errors import RunError
+from pipeline.export.columns import KINDS, kind_of, text_of
 from pipeline.export.records import BUILDINGS
 from pipeline.export.solid_geometry import SHAPE_COLUMNS
 
@@ -29,18 +28,6 @@ NO_TEXT = ""
 TILE = "tile"
 """The column that the folders' names carry."""
 
-STORED_TYPES: Mapping[str, str] = {
-    "string": "STRING",
-    "bool": "BOOLEAN",
-    "int32": "SCALAR, INT32",
-    "int64": "SCALAR, FLOAT64",
-    "double": "SCALAR, FLOAT64",
-    "timestamp": "STRING, ISO 8601",
-    "list": "STRING, a JSON array",
-}
-"""The type in a property table of each type of the tables. Whole numbers of 64 bits become floating-point numbers,
-exact to 2^53, since JavaScript would have them as BigInt, which does not mix with numbers."""
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class StoredColumn:
@@ -49,14 +36,14 @@ class StoredColumn:
     name: str
     """Name, that of the column."""
     kind: str
-    """An entry of `STORED_TYPES`."""
+    """An entry of `columns.KINDS`."""
     nullable: bool
     """Whether it has a value for null (`noData`); a column of only nulls is left out of a table."""
 
     @property
     def definition(self) -> dict[str, Any]:
         """The property in the class."""
-        words = STORED_TYPES[self.kind].split(", ")
+        words = KINDS[self.kind].tiles.split(", ")
         found: dict[str, Any] = {"type": words[0]}
         if words[0] == "SCALAR":
             found["componentType"] = words[1]
@@ -78,15 +65,14 @@ class StoredColumn:
         filled = [self.no_data if value is None else value for value in values]
         if self.kind in {"int32", "int64", "double"}:
             return np.array(filled, "<i4" if self.kind == "int32" else "<f8").tobytes(), None
-        texts = [_text(value).encode() for value in filled]
+        texts = [(text_of(value) or NO_TEXT).encode() for value in filled]
         return b"".join(texts), np.cumsum([0, *map(len, texts)]).astype("<u4").tobytes()
 
 
 def stored_column(field: pa.Field) -> StoredColumn:
     """A column of a table as a property; raises RunError if there is no type for it."""
-    kind = "timestamp" if pa.types.is_timestamp(field.type) else str(field.type)
-    kind = "list" if pa.types.is_list(field.type) else kind
-    if kind not in STORED_TYPES or (kind == "bool" and field.nullable):
+    kind = kind_of(field.type)
+    if kind not in KINDS or KINDS[kind].tiles == "none" or (kind == "bool" and field.nullable):
         raise RunError(
             f"column {field.name} has type {field.type}{' with nulls' if field.nullable else ''}, for which 3D Tiles "
             "have none: add it to the mapping"
@@ -101,10 +87,3 @@ COLUMNS = (
 """The properties of a building: its record without shapes, which are what is drawn."""
 BLOCK_COLUMNS = tuple(c for c in COLUMNS if c.name in {"building_id", "status", "roof_type", "height_m", TILE})
 """The properties of a coarse block."""
-
-
-def _text(value: Any) -> str:
-    """A value of a column of texts as it is stored."""
-    if isinstance(value, dt.datetime):
-        return value.isoformat()
-    return value if isinstance(value, str) else json.dumps(value, separators=(",", ":"))

@@ -12,18 +12,18 @@ from typing import Any
 from pipeline.errors import NothingToShowError, RunError
 from pipeline.export.cityjson import lines_of
 from pipeline.export.columns import ELEVATIONS
+from pipeline.export.folders import TERRAIN_FOLDER
 from pipeline.export.geoparquet import table_batches
 from pipeline.export.glb import Frame, SolidMesh, solid_mesh
-from pipeline.extras.publish.publishing import (
+from pipeline.extras.publish.finished_run import (
     ROWS,
+    SEQUENCES,
+    FinishedRun,
     Published,
-    check_complete,
     disk_at,
-    finished_run,
     path_outside,
+    refuse_occupied,
     sequences_of,
-    stated_files,
-    terrains_of,
 )
 from pipeline.extras.publish_3dtiles.globe import Geodesy, geodesy
 from pipeline.extras.publish_3dtiles.globe_glb import (
@@ -70,6 +70,14 @@ class PublishedTileset(Published):
     georeference: Mapping[str, Any]
     """`pipeline.extras.publish_3dtiles.globe.Geodesy.facts`."""
 
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """How it was placed."""
+        facts = self.georeference
+        accuracy = "unknown" if facts["accuracy_m"] is None else f"{facts['accuracy_m']:g} m"
+        added = "" if facts["geoid_height_m"] is None else f" ({facts['geoid_height_m']:+g} m)"
+        return f"{facts['transformation']}, accuracy {accuracy}", f"heights: {facts['heights']}{added}"
+
 
 def publish_3dtiles(
     run_dir: str,
@@ -79,30 +87,15 @@ def publish_3dtiles(
     geoid_height_m: float | None = None,
     on_event: Listener = ignore,
 ) -> PublishedTileset:
-    """Write a finished run as 3D Tiles in a folder, tile by tile; the folder appears whole, or stays what it was.
+    """Write a finished run as 3D Tiles in a folder, tile by tile; parameters and errors as in `publishing.Form`.
 
-    If the run has terrain, a second tileset beside the first shows it.
-
-    Raises SettingsError if `out` cannot be such a folder, and RunError if it holds something else, or a tileset that is
-    not to be replaced, if the CRS is unknown, if the run is not finished, changes meanwhile, lacks buildings or has no
-    model, or if something cannot be read or written.
-
-    Parameters
-    ----------
-    run_dir : str
-        The run directory, a folder or a URL.
-    out : str
-        The folder to write, a path of this machine.
-    overwrite : bool
-        Replace an earlier tileset.
-    geoid_height_m : float, optional
-        Height of the geoid above the ellipsoid, added to all elevations.
-    on_event : callable
-        Gets progress: tiles.
+    If the run has terrain, a second tileset beside the first shows it. `geoid_height_m` is the height of the geoid
+    above the ellipsoid, added to all elevations. An earlier tileset is replaced as a whole. Raises RunError if the CRS
+    is unknown, and NothingToShowError without a model.
     """
-    target = path_outside(run_dir, out, "3D Tiles are")
-    manifest, stated = finished_run(run_dir), stated_files(run_dir, {"cityjson", "buildings"})
-    reference = SpatialReference.of_facts(manifest.crs)
+    target = path_outside(run_dir, out)
+    run = FinishedRun.at(run_dir, {SEQUENCES, "buildings"})
+    manifest, reference = run.manifest, run.reference
     way = geodesy(reference, geoid_height_m)
     keys = {Tile.from_key(name): key for name, key in sequences_of(run_dir).items()}
     with disk_at(target):
@@ -113,7 +106,7 @@ def publish_3dtiles(
             made.make()
             tiles = _Tiles(run_dir, reference, city_unit_m(manifest.crs), way, made, on_event, len(keys), {})
             tree = grown(sorted(keys), lambda tile: tiles.leaf(tile, keys[tile]), tiles.skyline) if keys else None
-            check_complete(run_dir, manifest, {"buildings": tiles.counts.get("buildings", 0)}, stated)
+            run.check({"buildings": tiles.counts.get("buildings", 0)})
             if tree is None:
                 raise NothingToShowError(
                     f"no building of the run in {run_dir} has a model, so there is nothing to show"
@@ -137,14 +130,8 @@ def publish_3dtiles(
 
 def _refuse_occupied(target: Path, overwrite: bool) -> None:
     """Refuse a folder with other files than a tileset's, or with one unless it is to be replaced; raises RunError."""
-    if target.exists() and not target.is_dir():
-        raise RunError(f"{target} is a file: give the name of a folder")
-    held = sorted(path.name for path in target.iterdir()) if target.exists() else []
-    others = [name for name in held if name not in _MADE]
-    if others:
-        raise RunError(f"{target} holds {others[0]}, which is not of a tileset: give another --out")
-    if held and not overwrite:
-        raise RunError(f"{target} holds {held[0]} already: give another --out, or --overwrite to replace it")
+    held = target.iterdir() if target.is_dir() else ()
+    refuse_occupied(target, overwrite, held, "a tileset", _MADE.__contains__)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -226,7 +213,7 @@ class _Tiles:
 
     def terrain(self) -> tuple[Node, ...]:
         """Store the terrain of all tiles that have some; their nodes."""
-        keys = {Tile.from_key(name): key for name, key in terrains_of(self.run_dir).items()}
+        keys = {Tile.from_key(name): key for name, key in sequences_of(self.run_dir, TERRAIN_FOLDER).items()}
         found = []
         for done, tile in enumerate(sorted(keys), start=1):
             lines = lines_of(storage_at(self.run_dir).get(keys[tile]).decode())

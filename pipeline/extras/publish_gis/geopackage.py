@@ -2,7 +2,7 @@
 
 A layer has the columns of its table by the same names, without `bbox` (the layer has a spatial index) and without those
 of the solids: a layer has one geometry. `tile` is added, as every reader of the run's folders sees it. GeoPackage lacks
-some types of Arrow; `STORED_TYPES` says what each becomes. A layer is written as a stream of batches, so memory does
+some types of Arrow; `columns.KINDS` says what each becomes. A layer is written as a stream of batches, so memory does
 not grow with the run.
 """
 
@@ -10,26 +10,29 @@ from __future__ import annotations
 
 import dataclasses
 import datetime as dt
-import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+import pyarrow.fs as pafs
 import shapely
 
 from pipeline.errors import RunError
-from pipeline.export.columns import COLUMNS, TILE_COLUMN, kind_of
+from pipeline.export.columns import COLUMNS, HORIZONTAL, KINDS, TILE_COLUMN, VERTICAL, kind_of, text_of
 from pipeline.export.decisions import DECISIONS
 from pipeline.export.decisions import NAME as DECISIONS_NAME
 from pipeline.export.records import SCHEMAS
 from pipeline.export.solid_geometry import SOLID_COLUMNS
+from pipeline.extras.publish.finished_run import FinishedRun, Published, file_outside, new_file
 from pipeline.extras.publish_gis.gdal_layers import gdal_options, write_layer
-
-if TYPE_CHECKING:
-    from pipeline.extras.publish_gis.qml import Style
+from pipeline.extras.publish_gis.qml import STYLES as QGIS_STYLES
+from pipeline.extras.publish_gis.qml import Style
+from pipeline.io import arrow_at
+from pipeline.io.crs_units import unit_name
+from pipeline.runtime.monitoring.progress import Listener, ignore
 
 SUFFIX = ".gpkg"
 """Ending of the files: GDAL and QGIS warn of any other."""
@@ -119,23 +122,11 @@ LAYERS = (
 )
 """The layers of a file, in their order."""
 
-STORED_TYPES: Mapping[str, str] = {
-    "string": "TEXT",
-    "bool": "BOOLEAN",
-    "int32": "MEDIUMINT",
-    "int64": "INTEGER",
-    "double": "REAL",
-    "timestamp": "DATETIME",
-    "binary": "BLOB",
-    "list": "TEXT",
-}
-"""The type in the GeoPackage of each type of the tables; lists become the text of a JSON array."""
-
 
 def stored_field(field: pa.Field) -> pa.Field:
     """A column of a table as it is written; raises RunError if GeoPackage has no type for it."""
     kind = kind_of(field.type)
-    if kind not in STORED_TYPES:
+    if kind not in KINDS:
         raise RunError(
             f"column {field.name} has type {field.type}, for which GeoPackage has none: add it to the mapping"
         )
@@ -156,8 +147,7 @@ def _stored(column: pa.Array, name: str) -> pa.Array:
         return multi_polygons(column)
     kind = kind_of(column.type)
     if kind == "list":
-        texts = [None if value is None else json.dumps(value, separators=(",", ":")) for value in column.to_pylist()]
-        return pa.array(texts, pa.string())
+        return pa.array([text_of(value) for value in column.to_pylist()], pa.string())
     if kind == "timestamp":
         return pc.cast(pc.floor_temporal(column, unit="millisecond"), _MILLISECONDS)
     return column
@@ -243,3 +233,37 @@ class GeoPackage:
 def _zulu(at: dt.datetime) -> str:
     """A time as GDAL takes it in place of the time of day."""
     return at.astimezone(dt.UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+def publish_geopackage(run_dir: str, out: str, *, overwrite: bool = False, on_event: Listener = ignore) -> Published:
+    """Write a finished run as a GeoPackage, tile by tile; parameters and errors as in `publishing.Form`."""
+    target = file_outside(run_dir, out, SUFFIX, overwrite)
+    run = FinishedRun.at(run_dir, {layer.name for layer in LAYERS})
+    manifest, reference = run.manifest, run.reference
+    with new_file(target, overwrite) as path:
+        made = GeoPackage(
+            path=path,
+            wkt=(manifest.crs or {}).get("wkt"),
+            at=manifest.finished_at or manifest.started_at,
+            facts=run.facts,
+            units={
+                HORIZONTAL: unit_name(reference.horizontal_unit_m),
+                VERTICAL: unit_name(reference.vertical_unit_m),
+            },
+        )
+        rows = {}
+        for layer in LAYERS:
+            if layer.name == DECISIONS_NAME and not _has_decisions(run_dir):
+                continue
+            read = run.batches(layer.name, layer.columns, on_event)
+            rows[layer.name] = made.write(layer, (stored_batch(batch, layer, tile) for tile, batch in read))
+        made.write_styles(QGIS_STYLES)
+        run.check(rows)
+    return Published(place=str(target), size_bytes=target.stat().st_size, rows=rows)
+
+
+def _has_decisions(run_dir: str) -> bool:
+    """Whether a run has the table: those of older versions lack it."""
+    filesystem, place = arrow_at(run_dir)
+    found = filesystem.get_file_info(f"{place.rstrip('/')}/{DECISIONS_NAME}")
+    return bool(found.type is pafs.FileType.Directory)

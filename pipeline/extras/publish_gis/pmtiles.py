@@ -7,12 +7,9 @@ into tiles on the disk, so memory does not grow with the run.
 
 from __future__ import annotations
 
-import datetime as dt
 import itertools
-import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -20,10 +17,12 @@ import pyarrow.compute as pc
 import shapely
 
 from pipeline.errors import NothingToShowError
-from pipeline.export.columns import COLUMNS, ELEVATIONS, TILE_COLUMN, kind_of
-from pipeline.export.projection import Project
+from pipeline.export.columns import COLUMNS, ELEVATIONS, TILE_COLUMN, kind_of, text_of
+from pipeline.export.projection import Project, projection_to
 from pipeline.export.solid_geometry import SHAPE_COLUMNS
+from pipeline.extras.publish.finished_run import FinishedRun, Published, file_outside, new_file
 from pipeline.extras.publish_gis.gdal_layers import write_layer
+from pipeline.runtime.monitoring.progress import Listener, ignore
 
 SUFFIX = ".pmtiles"
 """Ending of the files, by which GDAL knows the format."""
@@ -43,18 +42,6 @@ GEOMETRY = "geometry"
 """The column of geometry."""
 LEFT_OUT = ("mesh_path", "input_hash", "settings_hash", "engine_version")
 """Columns that a map does not need: with them a file is a third larger, and most are the same for all buildings."""
-
-PROPERTY_TYPES: Mapping[str, str] = {
-    "string": "string",
-    "bool": "bool",
-    "int32": "int",
-    "int64": "int",
-    "double": "double",
-    "timestamp": "string, ISO 8601",
-    "binary": "none",
-    "list": "string, a JSON array",
-}
-"""The type of a value in the tiles for each type of the tables; a null is a property that is not there."""
 
 READ = tuple(
     column.name for column in COLUMNS[LAYER] if column.name not in SHAPE_COLUMNS and column.name not in LEFT_OUT
@@ -105,13 +92,7 @@ def _property(column: pa.Array, name: str, project: Project) -> pa.Array:
     kind = kind_of(column.type)
     if kind not in _TEXTS:
         return column
-    values = [None if value is None else _text(value) for value in column.to_pylist()]
-    return pa.array(values, pa.string())
-
-
-def _text(value: Any) -> str:
-    """A time or a list as text."""
-    return value.isoformat() if isinstance(value, dt.datetime) else json.dumps(value, separators=(",", ":"))
+    return pa.array([text_of(value) for value in column.to_pylist()], pa.string())
 
 
 def write_pmtiles(path: Path, batches: Iterable[pa.RecordBatch], facts: Mapping[str, str]) -> int:
@@ -152,3 +133,26 @@ def write_pmtiles(path: Path, batches: Iterable[pa.RecordBatch], facts: Mapping[
         geometry_type="MultiPolygon",
         crs=CRS,
     )
+
+
+def publish_pmtiles(run_dir: str, out: str, *, overwrite: bool = False, on_event: Listener = ignore) -> Published:
+    """Write the footprints of a finished run; parameters and errors as in `publishing.Form`.
+
+    Raises RunError if the run's CRS is unknown, too.
+    """
+    target = file_outside(run_dir, out, SUFFIX, overwrite)
+    run = FinishedRun.at(run_dir, {LAYER})
+    project = projection_to(run.manifest.crs, CRS)
+    unit_m = run.reference.vertical_unit_m
+    read = 0
+
+    def batches() -> Iterator[pa.RecordBatch]:
+        nonlocal read
+        for tile, batch in run.batches(LAYER, READ, on_event):
+            read += batch.num_rows
+            yield map_batch(batch, tile, project, unit_m)
+
+    with new_file(target, overwrite) as path:
+        rows = {LAYER: write_pmtiles(path, batches(), run.facts)}
+        run.check({LAYER: read})
+    return Published(place=str(target), size_bytes=target.stat().st_size, rows=rows)

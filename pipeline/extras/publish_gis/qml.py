@@ -64,61 +64,40 @@ class Fill:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Category:
-    """The rows with one value of a column."""
+class Class:
+    """The rows that are drawn alike."""
 
-    value: str
-    """The value; empty for all others."""
     label: str
     """Its line in the legend."""
     fill: Fill
     """Its fill."""
+    value: str = ""
+    """The value of the column; empty for all others."""
+    bounds: tuple[float, float] | None = None
+    """Its smallest and largest value in place of one; of two classes that hold a value, the first counts."""
+
+    def element(self, number: int) -> ET.Element:
+        """The class in the renderer, with the symbol of that number."""
+        shown = {"label": self.label, "symbol": str(number), "render": "true"}
+        if self.bounds is None:
+            return ET.Element("category", {"value": self.value, "type": "string", **shown})
+        lower, upper = map(repr, self.bounds)
+        return ET.Element("range", {"lower": lower, "upper": upper, **shown})
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Range:
-    """The rows whose value lies in a range."""
-
-    lower: float
-    """Smallest value."""
-    upper: float
-    """Largest value; of two ranges that hold a value, the first counts."""
-    label: str
-    """Its line in the legend."""
-    fill: Fill
-    """Its fill."""
-
-
-def categorized(column: str, categories: Sequence[Category]) -> str:
-    """The document of a layer that is drawn by the values of a column."""
-    renderer = ET.Element("renderer-v2", {"type": "categorizedSymbol", "attr": column, "symbollevels": "0"})
-    listed = ET.SubElement(renderer, "categories")
-    for number, one in enumerate(categories):
-        ET.SubElement(
-            listed,
-            "category",
-            {"value": one.value, "type": "string", "label": one.label, "symbol": str(number), "render": "true"},
-        )
-    return _document(renderer, [one.fill for one in categories])
-
-
-def graduated(column: str, ranges: Sequence[Range]) -> str:
-    """The document of a layer that is drawn by ranges of a column; rows without a value are not drawn."""
-    renderer = ET.Element(
-        "renderer-v2",
-        {"type": "graduatedSymbol", "attr": column, "graduatedMethod": "GraduatedColor", "symbollevels": "0"},
-    )
-    listed = ET.SubElement(renderer, "ranges")
-    for number, one in enumerate(ranges):
-        bounds = {"lower": repr(one.lower), "upper": repr(one.upper)}
-        ET.SubElement(listed, "range", {**bounds, "label": one.label, "symbol": str(number), "render": "true"})
-    return _document(renderer, [one.fill for one in ranges])
-
-
-def _document(renderer: ET.Element, fills: Sequence[Fill]) -> str:
-    """The document around a renderer, whose classes name the fills by number."""
+def style_of(column: str, classes: Sequence[Class]) -> str:
+    """The document of a layer that is drawn by a column, by values or by ranges; rows in no range are not drawn."""
+    is_graduated = classes[0].bounds is not None
+    kind = {"type": "categorizedSymbol", "attr": column, "symbollevels": "0"}
+    if is_graduated:
+        kind = {
+            "type": "graduatedSymbol", "attr": column, "graduatedMethod": "GraduatedColor", "symbollevels": "0"
+        }  # fmt: skip
+    renderer = ET.Element("renderer-v2", kind)
+    listed = ET.SubElement(renderer, "ranges" if is_graduated else "categories")
+    listed.extend(one.element(number) for number, one in enumerate(classes))
     symbols = ET.SubElement(renderer, "symbols")
-    symbols.extend(fill.element(str(number)) for number, fill in enumerate(fills))
+    symbols.extend(one.fill.element(str(number)) for number, one in enumerate(classes))
     root = ET.Element("qgis", {"version": _VERSION, "styleCategories": "Symbology"})
     root.append(renderer)
     ET.SubElement(root, "layerGeometryType").text = _POLYGONS
@@ -131,53 +110,53 @@ def _grey(level: int, pattern: str = "solid") -> Fill:
 
 
 STATUS_CLASSES = (
-    Category(value=Status.OK.value, label="delivered: a closed, valid model", fill=Fill(colour=(63, 134, 181, 255))),
-    Category(
+    Class(value=Status.OK.value, label="delivered: a closed, valid model", fill=Fill(colour=(63, 134, 181, 255))),
+    Class(
         value=Status.DOUBTFUL.value,
         label="doubtful: the points do not support the model",
         fill=Fill(colour=(216, 96, 60, 255)),
     ),
-    Category(
+    Class(
         value=Status.FALLBACK.value,
         label="fallback block: the roof could not be delivered",
         fill=Fill(colour=(227, 178, 60, 255)),
     ),
-    Category(value=Status.FAILED.value, label="failed: no model", fill=Fill(colour=(141, 79, 168, 255))),
+    Class(value=Status.FAILED.value, label="failed: no model", fill=Fill(colour=(141, 79, 168, 255))),
 )
 """Statuses of buildings."""
 
 DISTANCE_CLASSES = (
-    Range(lower=0.95, upper=1.0, label="95 % or more within 0.2 m", fill=Fill(colour=(44, 123, 182, 255))),
-    Range(lower=0.9, upper=0.95, label="90 to 95 %", fill=Fill(colour=(128, 191, 213, 255))),
-    Range(lower=0.75, upper=0.9, label="75 to 90 %", fill=Fill(colour=(255, 238, 170, 255))),
-    Range(lower=0.5, upper=0.75, label="50 to 75 %", fill=Fill(colour=(253, 174, 97, 255))),
-    Range(lower=0.0, upper=0.5, label="under 50 %", fill=Fill(colour=(202, 54, 47, 255))),
+    Class(bounds=(0.95, 1.0), label="95 % or more within 0.2 m", fill=Fill(colour=(44, 123, 182, 255))),
+    Class(bounds=(0.9, 0.95), label="90 to 95 %", fill=Fill(colour=(128, 191, 213, 255))),
+    Class(bounds=(0.75, 0.9), label="75 to 90 %", fill=Fill(colour=(255, 238, 170, 255))),
+    Class(bounds=(0.5, 0.75), label="50 to 75 %", fill=Fill(colour=(253, 174, 97, 255))),
+    Class(bounds=(0.0, 0.5), label="under 50 %", fill=Fill(colour=(202, 54, 47, 255))),
 )
 """Shares of the roof returns near the model, as on the page of the service: a chimney has few of them. The largest come
 first, so that a value between two ranges is in the upper one, as there."""
 
 SLOPE_CLASSES = (
-    Range(lower=0.0, upper=5.0, label="flat: up to 5 degrees", fill=Fill(colour=(247, 241, 221, 255))),
-    Range(lower=5.0, upper=20.0, label="5 to 20 degrees", fill=Fill(colour=(250, 210, 140, 255))),
-    Range(lower=20.0, upper=35.0, label="20 to 35 degrees", fill=Fill(colour=(243, 160, 88, 255))),
-    Range(lower=35.0, upper=50.0, label="35 to 50 degrees", fill=Fill(colour=(216, 97, 62, 255))),
-    Range(lower=50.0, upper=90.0, label="steep: more than 50 degrees", fill=Fill(colour=(141, 40, 56, 255))),
+    Class(bounds=(0.0, 5.0), label="flat: up to 5 degrees", fill=Fill(colour=(247, 241, 221, 255))),
+    Class(bounds=(5.0, 20.0), label="5 to 20 degrees", fill=Fill(colour=(250, 210, 140, 255))),
+    Class(bounds=(20.0, 35.0), label="20 to 35 degrees", fill=Fill(colour=(243, 160, 88, 255))),
+    Class(bounds=(35.0, 50.0), label="35 to 50 degrees", fill=Fill(colour=(216, 97, 62, 255))),
+    Class(bounds=(50.0, 90.0), label="steep: more than 50 degrees", fill=Fill(colour=(141, 40, 56, 255))),
 )
 """Slopes of roof planes."""
 
 REJECTED_CLASSES = (
-    Category(value=Reason.VEGETATION.value, label="vegetation", fill=_grey(205)),
-    Category(value=Reason.TOO_SMALL.value, label="too small", fill=_grey(170)),
-    Category(value=Reason.TOO_LOW.value, label="too low", fill=_grey(135)),
-    Category(value=Reason.TOO_NARROW.value, label="too narrow: a wall, a hedge", fill=_grey(100)),
-    Category(value=Reason.NO_WALLS.value, label="no walls: a mound, a bank", fill=_grey(130, "horizontal")),
-    Category(value=Reason.BELOW_Z_AVG.value, label="below the walls around it: a yard", fill=_grey(130, "vertical")),
-    Category(value=Reason.TOO_FEW_POINTS.value, label="too few points", fill=_grey(130, "b_diagonal")),
-    Category(value=Reason.BRIDGE.value, label="bridge", fill=_grey(130, "cross")),
-    Category(value=Reason.VEHICLE.value, label="vehicle, container", fill=_grey(130, "diagonal_x")),
-    Category(value=Reason.STRIPS_DISAGREE.value, label="flight strips that disagree", fill=_grey(60, "horizontal")),
-    Category(value=Reason.OVERRIDDEN.value, label="rejected by an override", fill=_grey(130, "f_diagonal")),
-    Category(value="", label="another reason", fill=_grey(230)),
+    Class(value=Reason.VEGETATION.value, label="vegetation", fill=_grey(205)),
+    Class(value=Reason.TOO_SMALL.value, label="too small", fill=_grey(170)),
+    Class(value=Reason.TOO_LOW.value, label="too low", fill=_grey(135)),
+    Class(value=Reason.TOO_NARROW.value, label="too narrow: a wall, a hedge", fill=_grey(100)),
+    Class(value=Reason.NO_WALLS.value, label="no walls: a mound, a bank", fill=_grey(130, "horizontal")),
+    Class(value=Reason.BELOW_Z_AVG.value, label="below the walls around it: a yard", fill=_grey(130, "vertical")),
+    Class(value=Reason.TOO_FEW_POINTS.value, label="too few points", fill=_grey(130, "b_diagonal")),
+    Class(value=Reason.BRIDGE.value, label="bridge", fill=_grey(130, "cross")),
+    Class(value=Reason.VEHICLE.value, label="vehicle, container", fill=_grey(130, "diagonal_x")),
+    Class(value=Reason.STRIPS_DISAGREE.value, label="flight strips that disagree", fill=_grey(60, "horizontal")),
+    Class(value=Reason.OVERRIDDEN.value, label="rejected by an override", fill=_grey(130, "f_diagonal")),
+    Class(value="", label="another reason", fill=_grey(230)),
 )
 """Reasons of rejected objects."""
 
@@ -186,25 +165,25 @@ STYLES = (
         layer="buildings",
         name="status",
         description="Delivered models, fallback blocks and failed candidates",
-        qml=categorized("status", STATUS_CLASSES),
+        qml=style_of("status", STATUS_CLASSES),
     ),
     Style(
         layer="buildings",
         name="distance of the points",
         description="Share of the roof returns within 0.2 m of the model; buildings without one are not drawn",
-        qml=graduated("share_within_0_2m", DISTANCE_CLASSES),
+        qml=style_of("share_within_0_2m", DISTANCE_CLASSES),
     ),
     Style(
         layer="planes",
         name="slope",
         description="Roof planes by slope",
-        qml=graduated("slope_deg", SLOPE_CLASSES),
+        qml=style_of("slope_deg", SLOPE_CLASSES),
     ),
     Style(
         layer="rejected",
         name="reason",
         description="Objects that are not buildings, in grey, by the reason",
-        qml=categorized("reason", REJECTED_CLASSES),
+        qml=style_of("reason", REJECTED_CLASSES),
     ),
 )
 """All styles; the first of a layer is its default."""

@@ -8,16 +8,38 @@ from __future__ import annotations
 
 import dataclasses
 import datetime as dt
+import functools
+import hashlib
+import json
+import os
 import re
-from collections.abc import Mapping, Sequence
-from pathlib import PurePosixPath
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from pathlib import Path, PurePosixPath
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 import shapely
 
+from pipeline.errors import RunError
 from pipeline.export.columns import COLUMNS, kind_of
-from pipeline.export.projection import Project
+from pipeline.export.folders import TERRAIN_FOLDER
+from pipeline.export.geoparquet import table_batches
+from pipeline.export.projection import Project, projection_to
+from pipeline.extras.publish.finished_run import (
+    ROWS,
+    FinishedRun,
+    Published,
+    disk_at,
+    new_files,
+    path_outside,
+    sequences_of,
+    states_of,
+)
+from pipeline.io import LocalStorage, arrow_at, is_url, storage_at
+from pipeline.io.formats import ENCODINGS
+from pipeline.runtime.manifest import InputFile, RunManifest
+from pipeline.runtime.monitoring.progress import Event, Listener, ignore
 
 VERSION = "1.1.0"
 """Version of STAC."""
@@ -27,6 +49,7 @@ COLLECTION = "collection.json"
 """File name of the Collection."""
 POINTS = "points"
 """Folder of the Collection of points and its Items."""
+_POINTS_COLLECTION = f"{POINTS}/{COLLECTION}"
 _EXTENSIONS = "https://stac-extensions.github.io"
 PROJECTION = f"{_EXTENSIONS}/projection/v2.0.0/schema.json"
 PROCESSING = f"{_EXTENSIONS}/processing/v1.2.0/schema.json"
@@ -55,14 +78,6 @@ DOCUMENTS: Mapping[str, tuple[str, str, str, str]] = {
     "points/tileset.json": ("points", "application/json", "visual", "3D Tiles: the points over the models"),
 }
 """Name, media type, role and title of the assets of a Collection, by their files in the run directory."""
-ENCODINGS: Mapping[str, tuple[str, str]] = {
-    "las": ("LAS", "application/vnd.las"),
-    "laz": ("LASzip", "application/vnd.laszip"),
-    "copc": ("COPC", "application/vnd.laszip+copc"),
-    "ply": ("PLY", "application/octet-stream"),
-    "ascii": ("text", "text/plain"),
-}
-"""`pc:encoding` and media type of the formats of points."""
 _KINDS = {"i": "signed", "u": "unsigned", "f": "floating"}
 _DEGREE_DIGITS = 7
 """Decimals of degrees: about a centimetre."""
@@ -74,25 +89,42 @@ _SPDX = re.compile(r"[A-Za-z0-9.+-]+")
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Run:
-    """What Collection and Items say about a run."""
+    """What all objects of a catalogue say about their run."""
 
     name: str
     """Name of the run: the id of the Collection."""
-    version: str
-    """Version of the program."""
-    method: str
-    """Name of the method."""
-    finished_at: dt.datetime
-    """When the models were made."""
-    licence: str | None
-    """Licence of the source data in the user's words; None if unknown."""
-    crs: Mapping[str, Any]
-    """The CRS, as a manifest holds it."""
+    manifest: RunManifest
+    """Its manifest."""
+    project: Project
+    """From the run's horizontal CRS to `CRS`."""
+
+    @functools.cached_property
+    def points(self) -> dict[str, InputFile]:
+        """The input files that gave points, by the ids of their Items; none in a run of an older version."""
+        inputs = self.manifest.inputs
+        return {points_key(one): one for one in inputs if one.file is not None and one.bounds_m is not None}
+
+    @property
+    def licence(self) -> str:
+        """The licence as an SPDX identifier; `other` if it is unknown or in other words."""
+        stated = self.manifest.source_licence
+        return stated if stated and _SPDX.fullmatch(stated) else "other"
 
     @property
     def lineage(self) -> str:
         """How the models came to be, in a sentence."""
-        return f"LoD2 building models from airborne laser scanning by gablework {self.version}, method {self.method}"
+        made_by = f"gablework {self.manifest.engine_version}, method {self.manifest.method}"
+        return f"LoD2 building models from airborne laser scanning by {made_by}"
+
+    @property
+    def made(self) -> str:
+        """When the models were made."""
+        return _zulu(self.manifest.finished_at or self.manifest.started_at)
+
+    def in_units(self, bounds_m: Sequence[float]) -> list[float]:
+        """Bounds in metres in the units of the CRS."""
+        unit_m = (self.manifest.crs or {}).get("horizontal_unit_m", 1.0)
+        return [value / unit_m for value in bounds_m]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -109,44 +141,153 @@ class TileFacts:
     """First and last acquisition of its buildings; None if unknown."""
     rows: Mapping[str, int]
     """Rows of its tables."""
-    points: Sequence[str] = ()
-    """Keys of the input files that gave points where it is."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class PointFacts:
-    """What an Item says about an input file of points: the whole file, whichever of its points the run took."""
+def publish_stac(
+    run_dir: str,
+    out: str,
+    *,
+    overwrite: bool = False,
+    name: str | None = None,
+    documents: Collection[str] = tuple(DOCUMENTS),
+    on_event: Listener = ignore,
+) -> Published:
+    """Write a STAC catalogue of a finished run; other parameters and errors as in `publishing.Form`.
 
-    name: str
-    """Name of the file, without its folder."""
-    address: str | None
-    """Its URL; None for a file of the machine that made the run."""
-    size_bytes: int
-    """Its size."""
-    sha256: str
-    """Digest of the file; of what was read of it, if that was less."""
-    is_digest_of_file: bool
-    """Whether `sha256` is that of the file."""
-    format: str
-    """A key of `ENCODINGS`."""
-    count: int
-    """Points in the file."""
-    bounds: tuple[float, float, float, float]
-    """Smallest x and y, largest x and y of its points, in CRS units."""
-    taken: tuple[float, float, float, float]
-    """The same of those points that the run took."""
-    density_per_m2: float | None
-    """Points per square metre of the bounds; None if these have no area."""
-    acquired: tuple[dt.datetime, dt.datetime] | None
-    """First and last acquisition of a sample of its points; None if unknown."""
-    dimensions: Mapping[str, str]
-    """What it has of each point: names, and types as numpy writes them, such as i4."""
+    Its files refer to those of the run. The Collection is placed last. Raises RunError if the folder holds another
+    catalogue, if the CRS is unknown, or if no tile has files.
 
-    @property
-    def key(self) -> str:
-        """The id of the Item: the name of the file, and the beginning of its digest."""
-        stem = re.sub(r"[^A-Za-z0-9]+", "_", PurePosixPath(self.name).stem)[:_STEM]
-        return f"{stem}-{self.sha256[:8]}"
+    Parameters
+    ----------
+    name : str, optional
+        Id of the Collection; the name of the run directory by default.
+    documents : collection of str
+        Files about the whole run to list, of `DOCUMENTS`, if they exist.
+    """
+    target = path_outside(run_dir, out)
+    manifest, storage = FinishedRun.at(run_dir, ()).manifest, storage_at(run_dir)
+    name = name or PurePosixPath(run_dir.rstrip("/") if is_url(run_dir) else Path(run_dir).resolve().as_posix()).name
+    run = Run(name=name, manifest=manifest, project=projection_to(manifest.crs, CRS))
+    files = {state["tile"]: listed(state["files"], state["tile"]) for state in states_of(run_dir) if state["files"]}
+    for tile, key in sequences_of(run_dir, TERRAIN_FOLDER).items():
+        files.setdefault(tile, {})[key] = hashlib.sha256(storage.get(key)).hexdigest()
+    finished = FinishedRun(place=run_dir, manifest=manifest, stated=[key for held in files.values() for key in held])
+    points = run.points
+    names = [
+        *(points_name(key) for key in points),
+        *([_POINTS_COLLECTION] if points else []),
+        *(item_name(tile) for tile in files),
+        COLLECTION,
+    ]
+    href = run_dir.rstrip("/") + "/" if is_url(run_dir) else _relative(Path(run_dir).resolve(), target)
+    with disk_at(target):
+        _refuse_other(target / COLLECTION, href)
+    with new_files(target, overwrite, names, lambda: _catalogue_files(target)) as made:
+        facts = []
+        for done, (tile, held) in enumerate(files.items(), start=1):
+            facts.append(_tile_facts(run_dir, tile, held, manifest))
+            on_event(Event(kind="progress", stage="items", done=done, total=len(files)))
+        if not facts:
+            raise RunError(f"the run in {run_dir} has no tile with files, so there is nothing to list")
+        below, size = _put_items(made, points_name, (points_item(one, run) for one in points.values()))
+        if below:
+            size += _put(made, _POINTS_COLLECTION, points_collection(run, below))
+        taken = shapely.STRtree([shapely.box(*run.in_units(one.bounds_m or ())) for one in points.values()])
+        place = href if is_url(href) else f"../{href}"
+        items, more = _put_items(made, item_name, (_item_of(one, run, place, taken) for one in dated(facts)))
+        there = [document for document in documents if storage.has(document)]
+        size += more + _put(made, COLLECTION, collection(run, items, there, href))
+        finished.check({"buildings": sum(tile.rows["buildings"] for tile in facts)})
+    return Published(place=str(target), size_bytes=size, rows={"items": len(items), "points": len(below)})
+
+
+def _tile_facts(run_dir: str, tile: str, files: Mapping[str, str], manifest: RunManifest) -> TileFacts:
+    """Where and when the objects of a tile are; if it has none, its square on the lattice."""
+    filesystem, place = arrow_at(run_dir)
+    boxes, times, rows = [], [], {}
+    for table, columns in (("buildings", ["acquired_from", "acquired_to", "bbox"]), ("rejected", ["bbox"])):
+        rows[table] = 0
+        if not any(name.startswith(f"{table}/") for name in files):  # nothing but terrain
+            continue
+        for batch in table_batches(place, table, columns, filesystem, [tile], ROWS):
+            rows[table] += batch.num_rows
+            boxes += [tuple(box.values()) for box in batch.column("bbox").to_pylist() if box]
+            for name in columns[:-1]:
+                times += [at for at in batch.column(name).to_pylist() if at]
+    unit_m = (manifest.crs or {}).get("horizontal_unit_m", 1.0)
+    boxes = boxes or [tuple(v / unit_m for v in square.bounds) for square in manifest.squares([tile])]
+    if not boxes:
+        raise RunError(f"the place of tile {tile} of the run in {run_dir} is unknown: run it again")
+    low, high = np.min(boxes, axis=0), np.max(boxes, axis=0)
+    return TileFacts(
+        key=tile,
+        files=files,
+        bounds=(float(low[0]), float(low[1]), float(high[2]), float(high[3])),
+        acquired=(min(times), max(times)) if times else None,
+        rows=rows,
+    )
+
+
+def _catalogue_files(target: Path) -> list[Path]:
+    """Files in a folder that a catalogue may have written."""
+    items = [path for path in target.glob("*/*.json") if path.stem == path.parent.name]
+    return [*items, *target.glob(f"{POINTS}/*.json"), *target.glob(COLLECTION)]
+
+
+def _refuse_other(place: Path, href: str) -> None:
+    """Refuse a folder with a Collection that is not of the run at `href`; raises RunError."""
+    if not place.is_file():
+        return
+    try:
+        held = json.loads(place.read_text(encoding="utf-8"))["assets"]["run"]["href"]
+    except (ValueError, KeyError, TypeError):
+        held = "something else"
+    if held != f"{href}run.json":
+        raise RunError(f"{place} is of another run or catalogue ({str(held)[:160]}): give another --out")
+
+
+def _relative(run: Path, target: Path) -> str:
+    """The run directory as seen from a folder, percent-encoded and ending in a slash."""
+    return quote(Path(os.path.relpath(run, target)).as_posix()) + "/"
+
+
+def _item_of(tile: TileFacts, run: Run, href: str, taken: shapely.STRtree) -> dict[str, Any]:
+    """The Item of a tile; its sources are the inputs whose points, those that the run took, reach into its bounds."""
+    keys = list(run.points) if len(taken) else []
+    return item(tile, run, href, [keys[k] for k in sorted(taken.query(shapely.box(*tile.bounds)).tolist())])
+
+
+def _put_items(
+    storage: LocalStorage, name_of: Callable[[str], str], items: Iterable[Mapping[str, Any]]
+) -> tuple[list[dict[str, Any]], int]:
+    """Write Items; what their Collection needs of them, and their size in bytes."""
+    kept, size = [], 0
+    for one in items:
+        size += _put(storage, name_of(one["id"]), one)
+        kept.append({name: one[name] for name in ("id", "bbox", "properties")})
+    return kept, size
+
+
+def _put(storage: LocalStorage, name: str, document: Mapping[str, Any]) -> int:
+    """Write a document; returns its size in bytes."""
+    content = json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False).encode() + b"\n"
+    storage.put(name, content)
+    return len(content)
+
+
+def moved_collection(content: bytes, folder: str) -> bytes:
+    """A Collection for a place above its folder."""
+    document = json.loads(content)
+    for link in document["links"]:
+        if link["href"].startswith("./"):
+            link["href"] = f"{folder}/{link['href'].removeprefix('./')}"
+    return json.dumps(document, separators=(",", ":"), ensure_ascii=False).encode()
+
+
+def points_key(points: InputFile) -> str:
+    """The id of the Item of an input file: its name, and the beginning of its digest."""
+    stem = re.sub(r"[^A-Za-z0-9]+", "_", PurePosixPath(points.path).stem)[:_STEM]
+    return f"{stem}-{points.sha256[:8]}"
 
 
 def points_name(key: str) -> str:
@@ -198,7 +339,7 @@ def dated(tiles: Sequence[TileFacts]) -> list[TileFacts]:
     return [dataclasses.replace(tile, acquired=tile.acquired or span) for tile in tiles]
 
 
-def item(tile: TileFacts, run: Run, project: Project, href: str) -> dict[str, Any]:
+def item(tile: TileFacts, run: Run, href: str, sources: Sequence[str] = ()) -> dict[str, Any]:
     """The Item of a tile.
 
     Parameters
@@ -207,118 +348,97 @@ def item(tile: TileFacts, run: Run, project: Project, href: str) -> dict[str, An
         The tile.
     run : Run
         Its run.
-    project : callable
-        From the run's horizontal CRS to `CRS`.
     href : str
         The run directory as seen from the Item, ending in a slash.
+    sources : sequence of str
+        Ids of the Items of the input files that gave points where it is.
     """
-    geometry, bbox = _place(tile.bounds, project)
-    return {
-        "type": "Feature",
-        "stac_version": VERSION,
-        "stac_extensions": [PROJECTION, PROCESSING, FILE, TABLE],
-        "id": tile.key,
-        "collection": run.name,
-        "bbox": bbox,
-        "geometry": shapely.geometry.mapping(geometry),
-        "properties": {
+    return _item(
+        tile.key,
+        run,
+        tile.bounds,
+        extensions=[PROJECTION, PROCESSING, FILE, TABLE],
+        collection=run.name,
+        properties={
             "title": f"Buildings of tile {tile.key}",
             **_times(tile.acquired, run),
             **_projection(tile.bounds, run),
-            "processing:software": {"gablework": run.version},
-            "processing:datetime": _zulu(run.finished_at),
+            "processing:software": {"gablework": run.manifest.engine_version},
+            "processing:datetime": run.made,
             "processing:lineage": run.lineage,
-            "license": _licence(run),
+            "license": run.licence,
         },
-        "links": [
+        links=[
             *(_link(rel, f"../{COLLECTION}") for rel in ("root", "parent", "collection")),
-            *(_link("derived_from", f"../{points_name(key)}", _GEOJSON) for key in tile.points),
+            *(_link("derived_from", f"../{points_name(key)}", _GEOJSON) for key in sources),
         ],
-        "assets": {
+        assets={
             name: _asset(name, path, digest, href) | _row_count(tile.rows.get(name))
             for path, digest in sorted(tile.files.items())
             if (name := asset_name(path, tile.key))
         },
-    }
+    )
 
 
-def points_item(points: PointFacts, run: Run, project: Project) -> dict[str, Any]:
-    """The Item of an input file of points; the file is an asset only if it has an address.
-
-    Parameters
-    ----------
-    points : PointFacts
-        The file.
-    run : Run
-        The run that read it.
-    project : callable
-        From the run's horizontal CRS to `CRS`.
-    """
-    geometry, bbox = _place(points.bounds, project)
-    encoding, kind = ENCODINGS[points.format]
-    digest = f", sha256 {points.sha256}" if points.is_digest_of_file else ""
-    return {
-        "type": "Feature",
-        "stac_version": VERSION,
-        "stac_extensions": [PROJECTION, POINTCLOUD, *([] if points.address is None else [FILE])],
-        "id": points.key,
-        "collection": _points_id(run),
-        "bbox": bbox,
-        "geometry": shapely.geometry.mapping(geometry),
-        "properties": {
-            "title": f"Points of {points.name}",
-            "description": f"The file {points.name}, {points.size_bytes} bytes{digest}",
-            **_times(points.acquired, run),
-            **_projection(points.bounds, run),
-            "license": _licence(run),
-            "pc:count": points.count,
+def points_item(points: InputFile, run: Run) -> dict[str, Any]:
+    """The Item of an input file: the whole file, whichever of its points the run took; an asset if it has a URL."""
+    file = points.file
+    assert file is not None
+    address, name = is_url(points.path), PurePosixPath(points.path).name
+    bounds = run.in_units(file.bounds_m)
+    x0, y0, x1, y1 = file.bounds_m
+    area_m2 = (x1 - x0) * (y1 - y0)
+    encoding, kind = ENCODINGS[file.format]
+    is_digest_of_file = not (address and file.format == "copc")  # a window of it has another digest
+    checksum = {"file:checksum": f"1220{points.sha256}"} if is_digest_of_file else {}
+    asset = {"href": points.path, **_described((kind, "data", f"the points, {encoding}"))}
+    return _item(
+        points_key(points),
+        run,
+        bounds,
+        extensions=[PROJECTION, POINTCLOUD, *([FILE] if address else [])],
+        collection=_points_id(run),
+        properties={
+            "title": f"Points of {name}",
+            "description": f"The file {name}, {points.size_bytes} bytes"
+            + (f", sha256 {points.sha256}" if is_digest_of_file else ""),
+            **_times(file.acquired, run),
+            **_projection(bounds, run),
+            "license": run.licence,
+            "pc:count": file.n_points,
             "pc:type": "lidar",
             "pc:encoding": encoding,
             "pc:schemas": [
-                {"name": name, "size": int(code[1:]), "type": _KINDS[code[0]]}
-                for name, code in points.dimensions.items()
+                {"name": name, "size": int(code[1:]), "type": _KINDS[code[0]]} for name, code in file.dimensions.items()
             ],
-            **({} if points.density_per_m2 is None else {"pc:density": round(points.density_per_m2, 3)}),
+            **({"pc:density": round(file.n_points / area_m2, 3)} if area_m2 > 0.0 else {}),
         },
-        "links": [
+        links=[
             _link("root", f"../{COLLECTION}"),
             *(_link(rel, f"./{COLLECTION}") for rel in ("parent", "collection")),
         ],
-        "assets": {}
-        if points.address is None
-        else {
-            "points": {
-                "href": points.address,
-                **_described((kind, "data", f"the points, {encoding}")),
-                "file:size": points.size_bytes,
-                **({"file:checksum": f"1220{points.sha256}"} if points.is_digest_of_file else {}),
-            }
-        },
-    }
+        assets={"points": {**asset, "file:size": points.size_bytes, **checksum}} if address else {},
+    )
 
 
 def points_collection(run: Run, items: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """The Collection of the points that a run read, of at least one Item; `items` as in `collection`."""
-    return {
-        "type": "Collection",
-        "stac_version": VERSION,
-        "stac_extensions": [],
-        "id": _points_id(run),
-        "title": f"Points of the building models {run.name}",
-        "description": "The files of points from which the models were made, as they were before the run left out any "
-        f"point. Licence: {run.licence or 'unknown'}.",
-        "license": _licence(run),
-        "extent": _extent(items),
-        "links": [
+    """The Collection of the points that a run read, of at least one Item."""
+    return _collection(
+        _points_id(run),
+        run,
+        items,
+        extensions=[],
+        title=f"Points of the building models {run.name}",
+        description="The files of points from which the models were made, as they were before the run left out any "
+        f"point. Licence: {run.manifest.source_licence or 'unknown'}.",
+        links=[
             *(_link(rel, f"../{COLLECTION}") for rel in ("root", "parent")),
             *(_link("item", f"./{one['id']}.json", _GEOJSON) for one in items),
         ],
-    }
+    )
 
 
-def collection(
-    run: Run, items: Sequence[Mapping[str, Any]], documents: Sequence[str], href: str, *, has_points: bool = False
-) -> dict[str, Any]:
+def collection(run: Run, items: Sequence[Mapping[str, Any]], documents: Sequence[str], href: str) -> dict[str, Any]:
     """The Collection of a run.
 
     Parameters
@@ -326,47 +446,56 @@ def collection(
     run : Run
         The run.
     items : sequence of mapping
-        `id`, `bbox` and times of its Items, at least one.
+        `id`, `bbox` and `properties` of its Items, at least one.
     documents : sequence of str
         Files of the run as a whole that exist, by their paths in it.
     href : str
         The run directory as seen from the Collection, ending in a slash.
-    has_points : bool
-        Whether there is a Collection of its points, too.
     """
-    return {
-        "type": "Collection",
-        "stac_version": VERSION,
-        "stac_extensions": [TABLE],
-        "id": run.name,
-        "title": f"Building models {run.name}",
-        "description": f"{run.lineage}. Licence of the source data: {run.licence or 'unknown'}.",
-        "license": _licence(run),
-        "extent": _extent(items),
-        "item_assets": {
+    licence = run.manifest.source_licence
+    return _collection(
+        run.name,
+        run,
+        items,
+        extensions=[TABLE],
+        title=f"Building models {run.name}",
+        description=f"{run.lineage}. Licence of the source data: {licence or 'unknown'}.",
+        item_assets={
             name: {**_described(ASSETS[name]), "table:columns": _columns(name)} for name in ASSETS if name in COLUMNS
         },
-        "links": [
+        links=[
             _link("root", f"./{COLLECTION}"),
-            *([_link("license", run.licence, "text/html")] if _is_url(run.licence) else []),
-            *([_link("child", f"./{POINTS}/{COLLECTION}")] if has_points else []),
+            *([_link("license", licence, "text/html")] if (licence or "").startswith(("https://", "http://")) else []),
+            *([_link("child", f"./{_POINTS_COLLECTION}")] if run.points else []),
             *(_link("item", f"./{item_name(one['id'])}", _GEOJSON) for one in items),
         ],
-        "assets": {
+        assets={
             name: {"href": href + path, **_described(words)}
             for path, (name, *words) in DOCUMENTS.items()
             if path in documents
         },
+    )
+
+
+def _item(key: str, run: Run, bounds: Sequence[float], *, extensions: list[str], **more: Any) -> dict[str, Any]:
+    """An Item at a place in the CRS; `more` are its collection, properties, links and assets."""
+    geometry, bbox = _place(bounds, run.project)
+    return {
+        "type": "Feature",
+        "stac_version": VERSION,
+        "stac_extensions": extensions,
+        "id": key,
+        "collection": more.pop("collection"),
+        "bbox": bbox,
+        "geometry": shapely.geometry.mapping(geometry),
+        **more,
     }
 
 
-def _points_id(run: Run) -> str:
-    """The id of the Collection of points."""
-    return f"{run.name}-{POINTS}"
-
-
-def _extent(items: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """The extent of the Items of a Collection in space and time."""
+def _collection(
+    key: str, run: Run, items: Sequence[Mapping[str, Any]], *, extensions: list[str], title: str, **more: Any
+) -> dict[str, Any]:
+    """A Collection of Items; `more` are its description, links, and what else it has."""
     first, last = (
         order(
             (one["properties"].get(name) or one["properties"]["datetime"] for one in items),
@@ -375,16 +504,32 @@ def _extent(items: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         for order, name in ((min, "start_datetime"), (max, "end_datetime"))
     )
     return {
-        "spatial": {"bbox": [_around([one["bbox"] for one in items])]},
-        "temporal": {"interval": [[first, last]]},
+        "type": "Collection",
+        "stac_version": VERSION,
+        "stac_extensions": extensions,
+        "id": key,
+        "title": title,
+        "description": more.pop("description"),
+        "license": run.licence,
+        "extent": {
+            "spatial": {"bbox": [_around([one["bbox"] for one in items])]},
+            "temporal": {"interval": [[first, last]]},
+        },
+        **more,
     }
+
+
+def _points_id(run: Run) -> str:
+    """The id of the Collection of points."""
+    return f"{run.name}-{POINTS}"
 
 
 def _projection(bounds: Sequence[float], run: Run) -> dict[str, Any]:
     """The CRS and a place in it."""
+    crs = run.manifest.crs or {}
     return {
-        "proj:code": None if run.crs.get("epsg") is None else f"EPSG:{run.crs['epsg']}",
-        "proj:wkt2": run.crs["wkt"],
+        "proj:code": None if crs.get("epsg") is None else f"EPSG:{crs['epsg']}",
+        "proj:wkt2": crs["wkt"],
         "proj:bbox": list(bounds),
     }
 
@@ -392,23 +537,13 @@ def _projection(bounds: Sequence[float], run: Run) -> dict[str, Any]:
 def _times(acquired: tuple[dt.datetime, dt.datetime] | None, run: Run) -> dict[str, str | None]:
     """When the points were measured; if that is unknown, when the models were made."""
     if acquired is None:
-        return {"datetime": _zulu(run.finished_at)}
+        return {"datetime": run.made}
     return {"datetime": None, "start_datetime": _zulu(acquired[0]), "end_datetime": _zulu(acquired[1])}
 
 
 def _zulu(at: dt.datetime) -> str:
     """A time as STAC writes it: UTC, with a Z."""
     return at.astimezone(dt.UTC).isoformat().replace("+00:00", "Z")
-
-
-def _licence(run: Run) -> str:
-    """The licence as an SPDX identifier; `other` if it is unknown or in other words."""
-    return run.licence if run.licence and _SPDX.fullmatch(run.licence) else "other"
-
-
-def _is_url(licence: str | None) -> bool:
-    """Whether the licence is the address of its text."""
-    return bool(licence and licence.startswith(("https://", "http://")))
 
 
 def _link(rel: str, href: str | None, kind: str = "application/json") -> dict[str, Any]:

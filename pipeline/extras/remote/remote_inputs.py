@@ -11,8 +11,9 @@ from pipeline.extras.remote.remote_file import RemoteFile
 from pipeline.extras.remote.retries import GaveUpError, persistently
 from pipeline.extras.remote.urls import filesystem_of, scheme_of
 from pipeline.extras.vector_files.tile_index import TileIndex, read_tile_index
-from pipeline.io.formats import ASCII_SUFFIXES, POINT_SUFFIXES, VALID, first_bytes, is_index, looks_like_points
-from pipeline.io.locations import name_in, shown
+from pipeline.io.formats import is_index
+from pipeline.io.locations import shown
+from pipeline.io.point_folders import point_files
 
 
 def files_at(url: str, cut: Callable[[TileIndex], Sequence[str]]) -> list[str]:
@@ -55,18 +56,4 @@ def _listed(url: str, *, pattern: bool) -> list[str]:
         if not files:
             raise UnreadableInputError(shown(url), "the pattern matches no file", "Check the pattern and the bucket")
         return files
-    points = [file for file in files if _is_point_file(file)]
-    if not points:
-        what = f"none of the {len(files)} files in the folder is a point file" if files else "the folder is empty"
-        raise UnreadableInputError(shown(url), what, VALID)
-    return points
-
-
-def _is_point_file(url: str) -> bool:
-    """Whether a file that was listed is meant, by its suffix, and text by its content."""
-    name = name_in(url).lower()
-    if name.startswith(".") or not name.endswith(POINT_SUFFIXES):
-        return False
-    if not name.endswith(ASCII_SUFFIXES):
-        return True
-    return looks_like_points(first_bytes(RemoteFile(url)))
+    return [file.url for file in point_files(shown(url), [RemoteFile(file) for file in files])]

@@ -12,24 +12,16 @@ import shapely
 
 from pipeline.errors import RunError
 from pipeline.export.geoparquet import table_batches
-from pipeline.extras.publish.publishing import (
-    Published,
-    check_complete,
-    disk_at,
-    facts_of,
-    file_outside,
-    finished_run,
-    refuse_existing,
-    stated_files,
-)
+from pipeline.export.result_file import SUFFIX, ResultFile
+from pipeline.extras.publish.finished_run import FinishedRun, Published, file_outside, new_file
 from pipeline.extras.solar.figures import Figures, figures
 from pipeline.extras.solar.horizon import obstacles_of
 from pipeline.extras.solar.roof_planes import RoofPlanes
 from pipeline.extras.solar.settings import SolarSettings
-from pipeline.extras.solar.solar_table import SUFFIX, SolarFile
+from pipeline.extras.solar.solar_table import TABLE
 from pipeline.extras.solar.true_north import convergence_deg, longitude_and_latitude
 from pipeline.extras.solar.weather import Site, Weather, YearOfLight, clear_sky, the_pvlib, weather_of, year_of_light
-from pipeline.io import LocalStorage, SpatialReference
+from pipeline.io import SpatialReference
 from pipeline.runtime.manifest import RunManifest
 from pipeline.runtime.monitoring.progress import Event, Listener, ignore
 from pipeline.runtime.run_tiles import TILES_IN_MEMORY, RunTiles
@@ -55,44 +47,30 @@ def solar(  # each is an option of the command
 ) -> Published:
     """Write what each roof plane of a finished run sees of the sky and receives of the sun in a year, as GeoParquet.
 
-    The file appears whole, or stays what it was.
-
-    Raises SettingsError if `out` cannot be such a file, and RunError if it exists, if the run is not finished, changes
-    meanwhile or lacks files, if pvlib is missing or the CRS unknown and irradiation is wanted, or if something cannot
-    be read or written; UnreadableInputError for a weather file.
+    The other parameters and errors are as in `publishing.Form`. Raises RunError if pvlib is missing or the CRS unknown
+    and irradiation is wanted, UnreadableInputError for a weather file.
 
     Parameters
     ----------
-    run_dir : str
-        The run directory, a folder or a URL.
-    out : str
-        The file to write, a path of this machine that ends in .parquet.
     settings : SolarSettings, optional
         Reach, samples, albedo and turbidity.
     weather : str, optional
         A file of a typical year; a clear sky without it.
     sky_only : bool
         Leave the columns of energy empty; neither pvlib nor a CRS is needed.
-    overwrite : bool
-        Replace an existing file.
-    on_event : callable
-        Gets progress: tiles.
     """
     settings = settings or SolarSettings()
-    target = file_outside(run_dir, out, "the table is", SUFFIX)
-    refuse_existing(target, overwrite)
-    manifest = finished_run(run_dir)
-    stated = stated_files(run_dir, {_TABLE})
-    run = _Run(run_dir, manifest)
+    target = file_outside(run_dir, out, SUFFIX, overwrite)
+    finished = FinishedRun.at(run_dir, {_TABLE})
+    run = _Run(run_dir, finished.manifest)
     light, light_facts = (None, {}) if sky_only else _light(run, settings, weather, on_event)
-    facts = {**facts_of(manifest), **_assumptions(settings, run.reference), **light_facts}
-    with disk_at(target), LocalStorage(root=target.parent).putting(target.name) as temporary:
-        with SolarFile(temporary, run.reference.projjson, facts) as file:
+    facts = {**finished.facts, **_assumptions(settings, run.reference), **light_facts}
+    with new_file(target, overwrite) as made:
+        with ResultFile(TABLE, made, run.reference.projjson, facts) as file:
             for done, tile in enumerate(run.tiles, start=1):
                 _write_tile(file, run, tile, settings, light)
                 on_event(Event(kind="progress", stage="solar", done=done, total=len(run.tiles)))
-        check_complete(run_dir, manifest, {}, stated)
-        refuse_existing(target, overwrite)
+        finished.check({})
     return Published(place=str(target), size_bytes=target.stat().st_size, rows={"planes": file.rows})
 
 
@@ -153,8 +131,8 @@ def _light(
     pvlib = the_pvlib()
     if run.reference.wkt is None:
         raise RunError(
-            "the CRS of the run is unknown, so the sun's place is, too: run it again with --crs, "
-            "such as EPSG:25832, or give --sky-only"
+            "the CRS of the run is unknown, so the sun's place is, too: run it again with --crs, such as EPSG:25832. "
+            "`gablework solar --sky-only` needs none"
         )
     site = run.site()
     if site is None:
@@ -194,7 +172,7 @@ def _assumptions(settings: SolarSettings, reference: SpatialReference) -> dict[s
     }
 
 
-def _write_tile(file: SolarFile, run: _Run, tile: str, settings: SolarSettings, light: YearOfLight | None) -> None:
+def _write_tile(file: ResultFile, run: _Run, tile: str, settings: SolarSettings, light: YearOfLight | None) -> None:
     """Add the rows of a tile, if it has any."""
     columns, planes = run.tile(tile)
     if not len(planes.faces):

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import pyarrow as pa
-
-from pipeline.export.columns import COUNT, FLOAT64, HORIZONTAL, INT32, NONE, SHARE, TEXT, WKB, Column
-from pipeline.export.result_file import SUFFIX, ResultFile, with_bbox
-
-__all__ = ["COLUMNS", "FACTS", "SCHEMA", "SUFFIX", "SolarFile"]
+from pipeline.export.columns import COUNT, FLOAT32S, FLOAT64, HORIZONTAL, INT32, NONE, SHARE, TEXT, WKB, Column
+from pipeline.export.result_file import ResultTable, with_bbox
 
 FACTS = "gablework_solar"
 """The key of the file's metadata that holds the assumptions, as JSON."""
@@ -25,7 +21,7 @@ COLUMNS = (
     Column("sky_view", FLOAT64, SHARE, "sky view factor, (1 + cos tilt) / 2 in the open; null without a face"),
     Column(
         "horizon_deg",
-        pa.list_(pa.float32()),
+        FLOAT32S,
         "deg",
         "elevation of the horizon in 72 azimuths, 5 degrees apart, from north clockwise, mean of the points; "
         "null without a face",
@@ -49,8 +45,5 @@ SCHEMA = with_bbox(COLUMNS)
 """The schema of the file."""
 
 
-class SolarFile(ResultFile):
-    """The file, while it is being written."""
-
-    columns = COLUMNS
-    facts_key = FACTS
+TABLE = ResultTable(COLUMNS, FACTS)
+"""The table."""

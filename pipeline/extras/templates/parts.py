@@ -1,7 +1,7 @@
 """An outline divided by straight cuts along its main directions into parts, each with a roof shape of its own.
 
 A gable with a flat annex, the two wings of an L, the three of a T: one cut after the other, at a corner of the outline
-or between points, as long as the points pay for it (a guillotine partition chosen by BIC).
+or between points, as long as the points pay for each (a guillotine partition chosen by BIC).
 """
 
 from __future__ import annotations

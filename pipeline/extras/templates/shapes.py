@@ -1,8 +1,8 @@
 """Roof shapes over one part of an outline: flat, pent, gable, hip and half-hip, fitted to few points by robust lines.
 
 Every plane falls along one axis of the part's frame, so a shape is the lower envelope of planes of two parameters each:
-a convex roof. The first fits have least freedom (the ridge in the middle, equal pitch); from the best of them planes go
-free, as long as the points pay for the parameters.
+a convex roof. The first fits have the least freedom (the ridge in the middle, equal pitch). From the best of them
+planes become free, as long as the points pay for the parameters.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Lines of a tile cut at their crossings: nodes on whole millimetres, no two of them closer than 2 mm.
 
 Snap rounding (Hobby 1999) puts nodes on whole millimetres. It leaves some 1 mm apart, which programs that snap vertices
-within a millimetre take for one. Of such nodes one stays, and lines through the others are led through it instead.
+within a millimetre take for one. One of such nodes stays, and lines through the others are led through it instead.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Terrain: that of each tile as triangles with the floors of buildings cut out, one task per tile.
+"""The terrain of each tile as triangles with the floors of buildings cut out, one task per tile.
 
-It is made in the run and not published from the run directory, since the ground is in scratch only.
+The run makes it; it cannot be published from the run directory, since only scratch holds the ground.
 """
 
 from __future__ import annotations

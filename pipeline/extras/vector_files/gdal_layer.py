@@ -12,9 +12,8 @@ import numpy.typing as npt
 
 from pipeline.errors import UnreadableInputError
 from pipeline.extras.vector_files.gdal_source import VALID, WHAT, GdalSource, gdal_source
-from pipeline.extras.vector_files.nearby import BATCH, Boxes, Nearby, Shape, cells_limit
+from pipeline.extras.vector_files.nearby import BATCH, Boxes, Nearby, Shape, VectorLayer, cells_limit
 from pipeline.extras.vector_files.vector_text import BYTES, Texts, without_controls
-from pipeline.extras.vector_files.wkb import EncodedLayer
 from pipeline.io.library_faults import in_our_words
 from pipeline.io.reading import moved
 
@@ -22,7 +21,7 @@ _Batch: TypeAlias = tuple[npt.NDArray[np.int64], npt.NDArray[np.object_]]
 """Feature ids and WKB of some features."""
 
 
-def read_by_gdal(path: Path, layer: str | None, boxes: Boxes | None, shape: Shape) -> EncodedLayer:
+def read_by_gdal(path: Path, layer: str | None, boxes: Boxes | None, shape: Shape) -> VectorLayer:
     """The layer, as `pipeline.extras.vector_files.vector_layer.read_layer` describes it.
 
     Raises UnreadableInputError if the file cannot be read, has not the layer, has too many values near the
@@ -32,7 +31,7 @@ def read_by_gdal(path: Path, layer: str | None, boxes: Boxes | None, shape: Shap
         return _read_source(path, source, layer, boxes, shape)
 
 
-def _read_source(path: Path, source: GdalSource, layer: str | None, boxes: Boxes | None, shape: Shape) -> EncodedLayer:
+def _read_source(path: Path, source: GdalSource, layer: str | None, boxes: Boxes | None, shape: Shape) -> VectorLayer:
     """The layer of a file as GDAL is given it."""
     import pyogrio
 
@@ -68,8 +67,13 @@ def _read_source(path: Path, source: GdalSource, layer: str | None, boxes: Boxes
             values = [texts.of_value(value, title, row) for value, row in zip(values, rows, strict=True)]
         if title != "gml_id" or values != [f"{name}.{number}" for number in feature_ids.tolist()]:
             named[title] = values  # else GDAL made the ids up when it wrote the file
-    elsewhere, bounds = (0, None) if nearby is None else (nearby.elsewhere, nearby.bounds_elsewhere)
-    return EncodedLayer(meta["crs"], feature_ids, wkb[kept], named, elsewhere, texts.warnings, bounds)
+    return VectorLayer.of(
+        wkb[kept],
+        feature_ids=feature_ids,
+        columns=named,
+        elsewhere=(nearby or Nearby(None, meta["crs"])).elsewhere,
+        warnings=texts.warnings,
+    )
 
 
 def _chosen(path: Path, layers: dict[str, str | None], layer: str | None, shape: Shape) -> str:
@@ -129,7 +133,7 @@ def _near(
     kept = [np.empty(0, np.int64)]
     passed_over = 0
     with in_our_words(path, WHAT, VALID), _opened(source.name, layer) as (crs, batches):
-        nearby = Nearby(boxes(crs), shape)
+        nearby = Nearby(boxes, crs, shape)
         if nearby.all:
             return None, nearby
         for feature_ids, wkb in batches:

@@ -17,9 +17,8 @@ import numpy.typing as npt
 import shapely
 
 from pipeline.errors import UnreadableInputError
-from pipeline.extras.vector_files.nearby import BATCH, POLYGONS, Boxes, Nearby, Shape, cells_limit
+from pipeline.extras.vector_files.nearby import BATCH, POLYGONS, Boxes, Nearby, Shape, VectorLayer, cells_limit
 from pipeline.extras.vector_files.vector_text import Texts
-from pipeline.extras.vector_files.wkb import EncodedLayer
 from pipeline.io.library_faults import in_our_words, shortened
 from pipeline.io.reading import moved
 
@@ -75,9 +74,7 @@ def geometry_column(path: Path, schema: pa.Schema, column: str | None = None) ->
     )
 
 
-def read_geoparquet(
-    path: Path, column: str | None, boxes: Boxes | None = None, shape: Shape = POLYGONS
-) -> EncodedLayer:
+def read_geoparquet(path: Path, column: str | None, boxes: Boxes | None = None, shape: Shape = POLYGONS) -> VectorLayer:
     """The layer of a file: all its columns but other geometries and what only covers one, as plain Python values.
 
     Features are wanted in `boxes`, as in `vector_layer.read_layer`. Their ids are their rows in the file.
@@ -90,7 +87,7 @@ def read_geoparquet(
     with in_our_words(path, "Parquet", "Write it again"), pq.ParquetFile(path) as file:
         about = geometry_column(path, file.schema_arrow, column)
         _check_size(path, "values, rows times columns", file.metadata.num_rows * len(about.wanted), DECODED_LIMIT)
-        nearby = Nearby(None if boxes is None else boxes(about.crs), shape)
+        nearby = Nearby(boxes, about.crs, shape)
         rows, batches, geometries = [np.empty(0, np.int64)], [], [np.empty(0, object)]
         first, cells = 0, 0
         for batch in file.iter_batches(BATCH, columns=about.wanted):
@@ -110,14 +107,12 @@ def read_geoparquet(
         for field, values in zip(table.column_names, table.columns, strict=True):
             if field != about.name and field not in attributes:  # of two columns of one name the first
                 attributes[field] = _values(values, field, numbers, texts)
-    return EncodedLayer(
-        about.crs,
-        numbers,
+    return VectorLayer.of(
         np.concatenate(geometries),
-        attributes,
-        nearby.elsewhere,
-        texts.warnings,
-        nearby.bounds_elsewhere,
+        feature_ids=numbers,
+        columns=attributes,
+        elsewhere=nearby.elsewhere,
+        warnings=texts.warnings,
     )
 
 

@@ -1,9 +1,10 @@
-"""Which features of a large vector file lie near the data, found batch by batch from their bounds alone."""
+"""The features of a layer; which of a large file lie near the data, found batch by batch from their bounds alone."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -34,6 +35,18 @@ def cells_limit(size_bytes: int) -> int:
     return min(CELLS_LIMIT, max(CELLS_OF_SMALL, CELLS_PER_BYTE * size_bytes))
 
 
+@dataclasses.dataclass(frozen=True, slots=True)
+class Elsewhere:
+    """The features of a file that were passed over, since they lie off the area that was asked for."""
+
+    count: int = 0
+    """Their number."""
+    bounds: tuple[float, ...] | None = None
+    """xmin, ymin, xmax, ymax of all in the file's CRS; None where there are none."""
+    crs: str | None = None
+    """That CRS; None where it is unknown."""
+
+
 class Shape(NamedTuple):
     """What the features of a layer are."""
 
@@ -45,6 +58,8 @@ class Shape(NamedTuple):
     """What they are to the reader of a message."""
     choose: str = "Give a file with one of its layers"
     """What to do where several layers hold such features; their names follow."""
+    one: str = "polygon"
+    """What one of their parts is."""
 
 
 POLYGONS = Shape(
@@ -67,19 +82,20 @@ class Nearby:
 
     Parameters
     ----------
-    boxes : array, optional
-        (k, 4) float64: xmin, ymin, xmax, ymax in the layer's CRS; None takes all features for near.
+    boxes : callable, optional
+        Where features are wanted; None takes all features for near.
+    crs : str, optional
+        The layer's CRS, as the file has it.
     shape : Shape
         What is counted of those that are passed over.
     """
 
-    def __init__(self, boxes: npt.NDArray[np.float64] | None, shape: Shape = POLYGONS) -> None:
+    def __init__(self, boxes: Boxes | None, crs: str | None, shape: Shape = POLYGONS) -> None:
         self._kinds = shape.kinds
-        self._tree = None if boxes is None else shapely.STRtree(shapely.box(*np.reshape(boxes, (-1, 4)).T))
-        self.elsewhere = 0
+        found = None if boxes is None else boxes(crs)
+        self._tree = None if found is None else shapely.STRtree(shapely.box(*np.reshape(found, (-1, 4)).T))
+        self.elsewhere = Elsewhere(crs=crs)
         """Polygons, or what the shape says, that were passed over."""
-        self.bounds_elsewhere: tuple[float, ...] | None = None
-        """xmin, ymin, xmax, ymax of these in the layer's CRS; None where there are none."""
 
     @property
     def all(self) -> bool:
@@ -97,8 +113,39 @@ class Nearby:
         near[np.flatnonzero(placed)[np.unique(self._tree.query(geometries[placed])[0])]] = True
         far = geometries[~near]
         far = far[np.isin(shapely.get_type_id(far), self._kinds)]
-        self.elsewhere += len(far)
         if len(far):
-            known = [] if self.bounds_elsewhere is None else [shapely.box(*self.bounds_elsewhere)]
-            self.bounds_elsewhere = tuple(shapely.total_bounds([*far, *known]).tolist())
+            before = self.elsewhere
+            known = [] if before.bounds is None else [shapely.box(*before.bounds)]
+            bounds = tuple(shapely.total_bounds([*far, *known]).tolist())
+            self.elsewhere = dataclasses.replace(before, count=before.count + len(far), bounds=bounds)
         return near
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class VectorLayer:
+    """The features of a layer. All arrays have one length n."""
+
+    feature_ids: npt.NDArray[np.int64]
+    """(n,) int64, the file's own numbers of the features."""
+    geometries: npt.NDArray[np.object_]
+    """(n,) shapely geometries; None where there is none, or where it cannot be read."""
+    unreadable: npt.NDArray[np.bool_]
+    """(n,) bool, True where there is a geometry that cannot be read."""
+    columns: Mapping[str, Sequence[Any]]
+    """All columns but the geometry, by name."""
+    elsewhere: Elsewhere
+    """Features of the wanted shape that were passed over, since they lie off the boxes, and the layer's CRS."""
+    warnings: tuple[str, ...] = ()
+    """What is odd but usable, one sentence each."""
+
+    @classmethod
+    def of(cls, wkb: npt.NDArray[np.object_], **facts: Any) -> VectorLayer:
+        """A layer of geometries as ISO WKB, (n,) bytes, None where there is none, and all else about it."""
+        geometries = geometries_of(wkb)
+        there = np.array([data is not None for data in wkb], np.bool_)
+        return cls(geometries=geometries, unreadable=there & shapely.is_missing(geometries), **facts)
+
+    @property
+    def crs(self) -> str | None:
+        """As the file has it: a code, WKT or PROJJSON; None where it is unknown."""
+        return self.elsewhere.crs

@@ -12,7 +12,7 @@ from typing import NoReturn
 from pipeline.errors import UnreadableInputError
 from pipeline.extras.vector_files.gdal_source import VALID
 from pipeline.extras.vector_files.nearby import Shape
-from pipeline.io.formats import CONVERT, LAS_SUFFIXES, UNREAD_VECTORS, VECTOR_FILE_SUFFIXES, first_bytes
+from pipeline.io.formats import CONVERT, LAS, UNREAD_VECTORS, VECTOR_FILE_SUFFIXES, first_bytes
 from pipeline.io.library_faults import in_our_words
 from pipeline.io.temporary import temporary_folder
 
@@ -70,7 +70,7 @@ def refuse_without_vectors(path: Path, members: Sequence[zipfile.ZipInfo]) -> No
     for ending, kind in UNREAD_VECTORS.items():
         if any(name.endswith(ending) for name in names):
             raise UnreadableInputError(str(path), f"{kind} is not read", CONVERT)
-    if any(name.endswith(LAS_SUFFIXES) for name in names):
+    if any(name.endswith(LAS.suffixes) for name in names):
         raise UnreadableInputError(str(path), "it is a zip archive of point clouds", "Give each point cloud unpacked")
     raise UnreadableInputError(str(path), "it is a zip archive with 0 vector files", VALID)
 

@@ -6,47 +6,17 @@ of the others are never read (GDAL), or let go batch by batch (GeoParquet).
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
-
-import numpy as np
-import numpy.typing as npt
-import shapely
 
 from pipeline.errors import InputError, UnreadableInputError
 from pipeline.extras.vector_files.gdal_layer import read_by_gdal
-from pipeline.extras.vector_files.nearby import POLYGONS, Boxes, Shape
+from pipeline.extras.vector_files.nearby import POLYGONS, Boxes, Shape, VectorLayer
 from pipeline.extras.vector_files.vector_archive import unpacked
-from pipeline.extras.vector_files.wkb import geometries_of
 from pipeline.io.formats import first_bytes
 from pipeline.io.locations import is_url, shown
 from pipeline.io.places import on_this_machine
 
 PARQUET_MAGIC = b"PAR1"
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class VectorLayer:
-    """The features of a layer. All arrays have one length n."""
-
-    crs: str | None
-    """As the file has it: a code, WKT or PROJJSON; None where it is unknown."""
-    feature_ids: npt.NDArray[np.int64]
-    """(n,) int64, the file's own numbers of the features."""
-    geometries: npt.NDArray[np.object_]
-    """(n,) shapely geometries; None where there is none, or where it cannot be read."""
-    unreadable: npt.NDArray[np.bool_]
-    """(n,) bool, True where there is a geometry that cannot be read."""
-    columns: Mapping[str, Sequence[Any]]
-    """All columns but the geometry, by name."""
-    elsewhere: int = 0
-    """Features of the wanted shape that were passed over, since they lie off the boxes."""
-    bounds_elsewhere: tuple[float, ...] | None = None
-    """xmin, ymin, xmax, ymax of these in the layer's CRS; None where there are none."""
-    warnings: tuple[str, ...] = ()
-    """What is odd but usable, one sentence each."""
 
 
 def read_layer(path: str | Path, layer: str | None, boxes: Boxes | None = None, shape: Shape = POLYGONS) -> VectorLayer:
@@ -81,21 +51,8 @@ def read_layer(path: str | Path, layer: str | None, boxes: Boxes | None = None, 
 
 def _read(path: Path, layer: str | None, boxes: Boxes | None, shape: Shape) -> VectorLayer:
     """The layer of a file of this machine."""
-    if first_bytes(path).startswith(PARQUET_MAGIC):
-        from pipeline.extras.vector_files.geoparquet_layer import read_geoparquet
+    if not first_bytes(path).startswith(PARQUET_MAGIC):
+        return read_by_gdal(path, layer, boxes, shape)
+    from pipeline.extras.vector_files.geoparquet_layer import read_geoparquet
 
-        found = read_geoparquet(path, layer, boxes, shape)
-    else:
-        found = read_by_gdal(path, layer, boxes, shape)
-    geometries = geometries_of(found.wkb)
-    there = np.array([data is not None for data in found.wkb], np.bool_)
-    return VectorLayer(
-        crs=found.crs,
-        feature_ids=found.feature_ids,
-        geometries=geometries,
-        unreadable=there & shapely.is_missing(geometries),
-        columns=found.columns,
-        elsewhere=found.elsewhere,
-        bounds_elsewhere=found.bounds_elsewhere,
-        warnings=found.warnings,
-    )
+    return read_geoparquet(path, layer, boxes, shape)

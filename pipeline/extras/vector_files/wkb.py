@@ -1,10 +1,8 @@
-"""Layers and geometries out of WKB that a stranger wrote."""
+"""Geometries out of WKB that a stranger wrote."""
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -22,25 +20,6 @@ _OF_POINTS = (2, 8)
 _OF_RINGS = (3, 17)
 """Polygons and triangles: so many rings of so many positions."""
 _FLAT = (_POINT, *_OF_POINTS, *_OF_RINGS)
-
-
-class EncodedLayer(NamedTuple):
-    """What a reader of one format hands on. All arrays have one length n."""
-
-    crs: str | None
-    """As the file has it; None where it is unknown."""
-    feature_ids: npt.NDArray[np.int64]
-    """(n,) int64, the file's own numbers of the features."""
-    wkb: npt.NDArray[np.object_]
-    """(n,) ISO WKB as bytes, None where there is no geometry."""
-    columns: Mapping[str, Sequence[Any]]
-    """All columns but geometries, by name."""
-    elsewhere: int
-    """Features of the wanted shape off the boxes, which were passed over."""
-    warnings: tuple[str, ...]
-    """What is odd but usable, one sentence each."""
-    bounds_elsewhere: tuple[float, ...] | None = None
-    """xmin, ymin, xmax, ymax of the features that were passed over, in the layer's CRS."""
 
 
 def geometries_of(wkb: npt.NDArray[np.object_]) -> npt.NDArray[np.object_]:

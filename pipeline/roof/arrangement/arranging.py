@@ -1,4 +1,4 @@
-"""The arrangement: labelled roof points and planes to roof faces that fill an outline exactly."""
+"""The arrangement: turns labelled roof points and planes into roof faces that fill an outline exactly."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
 """Candidate lines from the borders of coarse labels: where planes cross, else steps along the building's directions.
 
-A border between two labels is a set of places, each amid two neighbouring cells. Those near the line in which the two
-planes cross are a ridge, hip or valley and support that line exactly. The others are cut into steps: lines with a
-direction of the outline, of a contour or of a fall line of one of the planes, as long as they find enough places. Each
-is then moved to where it parts the points of the two planes at the least cost.
+A border between two labels is a set of places, each half-way between two neighbouring cells. Places near the line in
+which the two planes cross are a ridge, hip or valley and support that line exactly. The others are cut into steps:
+lines along the outline, a contour or a fall line of one of the planes, as long as they find enough places. Each line
+then moves to where it separates the points of the two planes at the least cost.
 """
 
 from __future__ import annotations

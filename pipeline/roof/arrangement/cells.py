@@ -1,10 +1,9 @@
-"""Which plane each cell of the subdivision belongs to: the points in it against borders and faces.
+"""The plane of each cell of the subdivision: the fit of its points weighed against the cost of borders and faces.
 
-The cost of a cell's label is the sum of its points' capped residuals, in unexplained points; a border costs by its
-length, a face by its existence: a short description of the roof (minimum description length) with the points as its
-data. Whether a face earns its cost is another question than where it ends: only the points that misfit the neighbouring
-plane count for it. A few points are enough evidence where they lie on its plane; where part of them misfit it too, as
-in a crown above the roof, the face has to be larger.
+The cost of a cell's label is the sum of its points' capped residuals, in unexplained points. A border costs points per
+length, a face a fixed number: the roof gets a short description (minimum description length). Only the points that
+misfit the neighbouring plane count for a face. A few points are enough evidence if they lie on its plane. If some of
+them misfit it as well, as in a crown above the roof, the face must be larger.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Roof faces from labelled cells: borders that cross are parted, cells united, rings traced.
+"""Roof faces from labelled cells: crossing borders are separated, cells united, rings traced.
 
 Where two borders cross, walls of four faces can meet in one vertical edge, or one face can touch itself: a solid with
-such an edge is not valid (val3dity's 303). A small corner of one face then goes to its neighbour, which parts them.
+such an edge is not valid (val3dity's 303). A small corner of one face then goes to its neighbour, which separates them.
 """
 
 from __future__ import annotations

@@ -1,12 +1,13 @@
-"""Corners where a roof plane leaves all points around it: cut off, and given to a plane that does not.
+"""Corners where a roof plane departs from all points around it: they are cut off and given to a plane that fits.
 
-Where two lines meet far beyond the end of a ridge, or a slope runs on into a part of the outline that holds something
-else, one cell spans an explained and an unexplained part, and the few points there count too little: the roof gets a
-fin. Such a cell is cut once more, along the line in which its plane meets that of the part beyond, else where its
-edges come near the points again. Then a plane costs in every cell at whose corners another is nearer to the points.
+If two lines meet far beyond the end of a ridge, or a slope continues into a part of the outline that holds something
+else, one cell spans an explained and an unexplained part. The few points there count too little, and the roof gets a
+fin. Such a cell is cut once more, along the line in which its plane meets the plane of the part beyond, or else where
+its edges come near the points again. Then a plane costs extra in every cell at whose corners another plane is nearer to
+the points.
 
-Down an eave or up to the top of a pent roof a plane may go on beyond its last points: by its slope, up to 1, over the
-distance within which points are looked for; down an eave also over the distance of the next ones where there are none.
+Down an eave or up to the top of a pent roof a plane may continue beyond its last points: by its slope (at most 1) times
+the search distance for points. Down an eave without points nearby, the distance to the next points counts instead.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Guides among the candidate lines: given straight pieces of ridges, hips, valleys, steps and eaves.
 
-A guide supports itself over its whole length, so it cuts cells also where the points show no border. The places of the
-coarse labels near it support it as well, in place of the line that was found there: that line goes where nothing else
-supports it. Borders on guides cost nothing, and corners on them move along them only. Whether a border runs there is
-still decided by the points.
+A guide supports itself over its whole length, so it cuts cells also where the points show no border. Places of the
+coarse labels near it support the guide instead of the line that was found there; that line is dropped if nothing else
+supports it. Borders on guides cost nothing, and corners on them move along them only. The points still decide whether a
+border runs there.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
-"""Planes that meet where their faces meet: fitted once more, on condition that neighbours agree at common vertices.
+"""Planes are fitted once more, on condition that neighbours agree at the vertices of their common border.
 
 Fitted one by one, three planes that meet in one corner of a roof miss it by centimetres, and the solid gets small walls
 and clusters of vertices there. Each condition "these two planes have one height over this vertex" is linear, so least
-squares under it is one step of a Kalman filter with an exact measurement (Kalman 1960), in which a plane counts by the
-noise of its points: one that they show well moves less. Conditions come in order of their costs. One that costs more
-points than a corner must save is left out, and so is one that moves a plane farther from its points than the settings
-allow: such a gap is real, or the corner lies in the wrong place.
+squares under it is one step of a Kalman filter with an exact measurement (Kalman 1960), in which the noise of its
+points weighs each plane: a plane that they determine well moves less. Conditions come in order of their costs. One that
+costs more points than a corner must save is left out, and so is one that moves a plane farther from its points than the
+settings allow: such a gap is real, or the corner lies in the wrong place.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Borders of roof faces with as few corners as the points need: vertices that pay too little go to a neighbour.
+"""Borders of roof faces with as few corners as the points need: vertices that pay too little merge with a neighbour.
 
 A vertex of the faces' borders is worth a few points (minimum description length). It is merged with a neighbour where
 that changes the costs of the points by less: jogs of steps become straight, clusters of vertices become one, a hip that

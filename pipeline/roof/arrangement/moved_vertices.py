@@ -1,8 +1,8 @@
 """Vertices of roof faces where the planes beside them meet: the end of a ridge lies where its three slopes cross.
 
 A border between two planes that cross lies best on the line of their crossing, and a vertex where the planes of all its
-borders have one height. There planes need not leave their points to meet. A vertex goes to the nearest such place, as
-far as the points do not speak against it; on the outline and on steps it slides along their line.
+borders have one height. There planes need not leave their points to meet. A vertex moves to the nearest such place
+unless the points contradict it; on the outline and on steps it slides along their line.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Planes fitted anew to the points of the places that they were given."""
+"""Refits planes to the points of the places that they were given."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""An outline cut into cells by chords: an adaptive subdivision whose vertices lie on the millimetre grid all the time.
+"""An outline cut into cells by chords: an adaptive subdivision whose vertices always lie on the millimetre grid.
 
 The cells are faces of a planar graph of half-edges (Muller and Preparata 1978). A line cuts only the cells in which it
-has support, each along a chord from border to border. A chord ends at a vertex, or at a new one that is rounded to
-1 mm and belongs to the edges of both cells beside it. Cells therefore share their borders exactly by construction and
+has support, each along a chord from border to border. A chord ends at a vertex, or at a new one that is rounded to 1 mm
+and belongs to the edges of both cells beside it. Cells therefore share their borders exactly by construction and
 nothing is snapped afterwards. Every chord, and every edge that a rounded vertex bends, is tested with exact integers
 against all other edges; one that would touch them is not drawn.
 

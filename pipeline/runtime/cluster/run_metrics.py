@@ -21,19 +21,9 @@ from prometheus_client.registry import Collector
 from pipeline.errors import SettingsError
 from pipeline.runtime.monitoring.measurement import TALLIES, Tallies, peak_of_process
 from pipeline.runtime.monitoring.progress import Event, Listener
+from pipeline.runtime.monitoring.stages import STAGES
 
-UNITS = {
-    "plan": "files",
-    "ingest": "files",
-    "cells": "tiles",
-    "ground": "blocks",
-    "split": "tiles",
-    "redraw": "tiles",
-    "join": "blocks",
-    "outline": "tasks",
-    "reconstruct": "buildings",
-    "publish": "tiles",
-}
+UNITS = {stage.name: stage.unit for stage in STAGES}
 """Units counted by each stage; other stages count tasks."""
 
 

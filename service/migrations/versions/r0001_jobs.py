@@ -97,9 +97,3 @@ def upgrade() -> None:
         sa.Column("created_at", _TIME, nullable=False),
         sa.Column("revoked_at", _TIME, nullable=True),
     )
-
-
-def downgrade() -> None:
-    """Remove the tables with their content."""
-    for table in ("keys", "job_uploads", "uploads", "job_events", "jobs"):
-        op.drop_table(table)

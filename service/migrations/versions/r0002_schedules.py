@@ -82,11 +82,3 @@ def upgrade() -> None:
     op.create_index("schedule_uploads_by_upload", "schedule_uploads", ["upload_id"])
     op.add_column("jobs", sa.Column("schedule_id", sa.String(32), nullable=True))
     op.create_index("jobs_by_schedule", "jobs", ["schedule_id", "status"])
-
-
-def downgrade() -> None:
-    """Remove the tables with their content; jobs stay."""
-    op.drop_index("jobs_by_schedule", "jobs")
-    op.drop_column("jobs", "schedule_id")
-    for table in ("schedule_uploads", "schedule_runs", "schedules"):
-        op.drop_table(table)

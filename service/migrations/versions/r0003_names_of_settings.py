@@ -12,7 +12,7 @@ from typing import Any
 import sqlalchemy as sa
 from alembic import op
 
-from pipeline.parameters import RENAMED
+from pipeline.renamed_settings import RENAMED
 
 revision = "0003"
 down_revision = "0002"
@@ -31,10 +31,6 @@ def upgrade() -> None:
             if renamed != settings:
                 changed = request | {"settings": renamed}
                 connection.execute(sa.update(rows).where(rows.c[key] == identity).values(request=changed))
-
-
-def downgrade() -> None:
-    """Keep the new names: two old names became `min_points`, so the old ones are lost."""
 
 
 def _renamed(values: Any) -> Any:

@@ -33,8 +33,3 @@ def upgrade() -> None:
         sa.Column("body", sa.Text, nullable=True),
     )
     op.create_index("idempotency_keys_by_end", "idempotency_keys", ["until"])
-
-
-def downgrade() -> None:
-    """Remove the table with its content."""
-    op.drop_table("idempotency_keys")

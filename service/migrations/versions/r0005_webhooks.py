@@ -86,12 +86,6 @@ def upgrade() -> None:
     )
 
 
-def downgrade() -> None:
-    """Remove the tables with their content; what was not sent is lost."""
-    for table in ("webhook_attempts", "webhook_deliveries", "webhook_secrets", "webhooks"):
-        op.drop_table(table)
-
-
 def _secret() -> list[sa.Column[object]]:
     """The columns of a secret and of the one that it replaced."""
     return [

@@ -26,10 +26,3 @@ def upgrade() -> None:
     for name, kind in _COLUMNS:
         op.add_column("keys", sa.Column(name, kind, nullable=True))
     op.create_index("keys_by_old_digest", "keys", ["old_digest"], unique=True)
-
-
-def downgrade() -> None:
-    """Remove them: keys that expired are valid again, and only the newest secret of each."""
-    op.drop_index("keys_by_old_digest", "keys")
-    for name, _ in _COLUMNS:
-        op.drop_column("keys", name)

@@ -18,8 +18,3 @@ depends_on = None
 def upgrade() -> None:
     """Add the column; no job of before is kept."""
     op.add_column("jobs", sa.Column("keep", sa.Boolean, nullable=False, server_default=sa.false()))
-
-
-def downgrade() -> None:
-    """Remove it: old jobs may be removed again."""
-    op.drop_column("jobs", "keep")

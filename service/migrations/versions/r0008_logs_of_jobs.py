@@ -30,10 +30,3 @@ def upgrade() -> None:
         sa.Column("message", sa.Text, nullable=False),
         sa.Column("facts", sa.JSON(none_as_null=True), nullable=True),
     )
-
-
-def downgrade() -> None:
-    """Remove them, with all logs."""
-    op.drop_table("job_log")
-    op.drop_column("jobs", "last_log_line")
-    op.drop_column("jobs", "watched_at")

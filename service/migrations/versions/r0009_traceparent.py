@@ -18,8 +18,3 @@ depends_on = None
 def upgrade() -> None:
     """Add the column; jobs of before belong to no trace."""
     op.add_column("jobs", sa.Column("traceparent", sa.String(55), nullable=True))
-
-
-def downgrade() -> None:
-    """Remove it: jobs begin traces of their own."""
-    op.drop_column("jobs", "traceparent")

@@ -22,9 +22,3 @@ def upgrade() -> None:
     op.add_column("jobs", sa.Column("other_ends", sa.Integer, nullable=False, server_default="0"))
     op.add_column("jobs", sa.Column("progress_due_at", sa.DateTime(timezone=True), nullable=True))
     op.add_column("jobs", sa.Column("inputs_until", sa.DateTime(timezone=True), nullable=True))
-
-
-def downgrade() -> None:
-    """Remove them; kept inputs may be removed by now."""
-    for name in ("inputs_until", "progress_due_at", "other_ends", "own_end_stage", "own_ends"):
-        op.drop_column("jobs", name)

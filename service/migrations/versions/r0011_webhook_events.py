@@ -47,18 +47,3 @@ def upgrade() -> None:
     op.add_column("webhooks", sa.Column("paused_at", _TIME, nullable=True))
     # there are no events yet, so any time that has passed is right
     op.execute("UPDATE webhooks SET sent_until = updated_at")
-
-
-def downgrade() -> None:
-    """Remove them: what waits for room, and messages that were not sent yet, are lost."""
-    for name in ("owner", "sent_until", "is_behind", "paused_at"):
-        op.drop_column("webhooks", name)
-    # the version before reads the job as it was from the delivery, and these have it in the event
-    newer = "webhook_deliveries WHERE event_id IS NOT NULL"
-    op.execute(f"DELETE FROM webhook_attempts WHERE delivery_id IN (SELECT delivery_id FROM {newer})")  # noqa: S608
-    op.execute(f"DELETE FROM {newer}")  # noqa: S608
-    for name, _, _ in _INDEXES:
-        op.drop_index(f"webhook_deliveries_{name}", "webhook_deliveries")
-    for name in ("event_id", "replay_at"):
-        op.drop_column("webhook_deliveries", name)
-    op.drop_table("webhook_events")

@@ -71,19 +71,3 @@ def upgrade() -> None:
         op.drop_column("webhooks", name)
     for name, _ in _SECRETS:
         op.drop_column("webhook_secrets", name)
-
-
-def downgrade() -> None:
-    """Bring the columns back; the places in the events begin anew."""
-    for table in ("webhooks", "webhook_secrets"):
-        for name, kind in _SECRETS:
-            op.add_column(table, sa.Column(name, kind, nullable=True))
-    for name, kind in _PLACES:
-        op.add_column("webhooks", sa.Column(name, kind, nullable=True))
-    op.add_column("webhooks", sa.Column("is_behind", sa.Boolean, nullable=False, server_default=sa.false()))
-    op.execute("UPDATE webhooks SET sent_until = CURRENT_TIMESTAMP")
-    for name in _BODIES:
-        op.add_column("webhook_events", sa.Column(name, sa.Text, nullable=True))
-    op.add_column("webhook_deliveries", sa.Column("snapshot", sa.JSON, nullable=False, server_default="null"))
-    op.add_column("webhook_deliveries", sa.Column("replay_at", _TIME, nullable=True))
-    op.create_index("webhook_deliveries_by_replay", "webhook_deliveries", ["replay_at", "endpoint_id"])

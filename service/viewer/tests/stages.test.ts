@@ -21,5 +21,5 @@ it("A job has the stages of what it makes, in their order", () => {
 it("A stage that the page does not know is shown by its name", () => {
   expect(stageNamed("reconstruct").unit).toBe("buildings");
   expect(stageNamed("compile").words).toBe("Compile, once on this machine");
-  expect(stageNamed("weigh")).toEqual({ name: "weigh", words: "weigh", unit: "" });
+  expect(stageNamed("weigh")).toMatchObject({ name: "weigh", words: "weigh", unit: "" });
 });

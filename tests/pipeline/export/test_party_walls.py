@@ -14,19 +14,19 @@ import pytest
 import shapely
 import small_buildings as small
 from command_line import invoke
-from small_runs import content, moved, restated, write_run
+from small_runs import content, moved, write_run
 
 import pipeline.extras.party_walls.party_walls_of_run as runs
 from pipeline.errors import RunError, SettingsError
 from pipeline.export.geoparquet import read_table
 from pipeline.export.records import RecordContext
+from pipeline.export.result_file import ResultFile
 from pipeline.export.tile import write_tile
-from pipeline.extras.party_walls.party_wall_tables import BUILDINGS, FACTS, WALLS, PartyWallFile
+from pipeline.extras.party_walls.party_wall_tables import BUILDINGS, FACTS, WALLS
 from pipeline.extras.party_walls.party_walls_of_run import party_walls
 from pipeline.extras.party_walls.settings import PartyWallSettings
 from pipeline.model import BuildingResult, Reason, Status
 from pipeline.runtime.digest import run_digest
-from pipeline.runtime.manifest import RunStatus
 from pipeline.runtime.run_tiles import TILES_IN_MEMORY
 
 TILES = 20
@@ -195,31 +195,16 @@ def test_what_cannot_be_written_or_read_is_refused_and_leaves_the_files_of_befor
         party_walls(str(run_dir), str(out), buildings=str(areas))
     with pytest.raises(SettingsError, match=r"--out and --buildings are both .*a\.parquet: give two files"):
         party_walls(str(run_dir), str(out), buildings=str(out))
-    for place, words in (("a.csv", r"ends in \.csv"), (run_dir / "a.parquet", "run directory")):
-        with pytest.raises(SettingsError, match=words):
-            party_walls(str(run_dir), str(place))
 
     def broken(*_: Any) -> None:
         raise RunError("the disk is gone")
 
     with monkeypatch.context() as patched:
-        patched.setattr(PartyWallFile, "write", broken)
+        patched.setattr(ResultFile, "write", broken)
         with pytest.raises(RunError, match="the disk is gone"):
             party_walls(str(run_dir), str(out), buildings=str(areas), overwrite=True)
-    restated(run_dir, status=RunStatus.RUNNING)
-    with pytest.raises(RunError, match="is running, not finished"):
-        party_walls(str(run_dir), str(out), buildings=str(areas), overwrite=True)
     assert areas.read_text() == "of before"
     assert {path.name for path in tmp_path.iterdir()} == {"run", "b.parquet"}
-
-
-def test_a_run_that_changes_meanwhile_is_refused(
-    run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(runs, "_write_tile", lambda *_: restated(run_dir, status=RunStatus.RUNNING))
-    with pytest.raises(RunError, match="changed while it was published"):
-        party_walls(str(run_dir), str(tmp_path / "a.parquet"))
-    assert not (tmp_path / "a.parquet").exists()
 
 
 def test_the_command_writes_and_says_what(run_dir: Path, tmp_path: Path) -> None:

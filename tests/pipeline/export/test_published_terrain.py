@@ -14,12 +14,12 @@ from glb_rules import chunks
 from small_runs import content, moved, restated, street, tiled_run
 
 from pipeline.errors import RunError
-from pipeline.extras.publish.publishing import publish_cityjson, publish_stac
+from pipeline.extras.publish.cityjson_file import publish_cityjson
 from pipeline.extras.publish_3dtiles.globe_terrain import PlacedTerrain, terrain_glb
 from pipeline.extras.publish_3dtiles.publishing_3dtiles import publish_3dtiles
+from pipeline.extras.publish_stac.stac import publish_stac
 from pipeline.extras.terrain_tin.terrain_files import TerrainTriangles, read_terrain, terrain_lines, terrain_path
 from pipeline.io import storage_at
-from pipeline.runtime.manifest_reading import read_manifest
 
 GEOID_M = 43.2
 BORDER_X = 85_250.0
@@ -205,11 +205,3 @@ def test_a_closed_courtyard_is_a_surface_of_its_own(contexts: small.Contexts) ->
         {False},
     ]
     assert np.array_equal(read_terrain(lines).triangles, both.triangles)
-
-
-def test_the_run_stays_as_it_is(run_dir: Path, tmp_path: Path) -> None:
-    before = content(run_dir)
-    for number, write in enumerate((publish_3dtiles, publish_cityjson, publish_stac)):
-        write(str(run_dir), str(tmp_path / f"out{number}"))
-    assert content(run_dir) == before
-    assert read_manifest(run_dir).counts == {"candidates": 4}

@@ -19,25 +19,19 @@ from command_line import invoke
 from glb_rules import chunks
 from small_runs import moved, reference_of, street, tiled_run
 
-from pipeline.errors import RunError, SettingsError
+from pipeline.errors import RunError
+from pipeline.export.columns import KINDS
 from pipeline.export.dimensions import volume
 from pipeline.export.geoparquet import read_table
 from pipeline.export.records import SCHEMAS
 from pipeline.export.solid_geometry import SHAPE_COLUMNS
 from pipeline.extras.publish_3dtiles import globe_tileset
 from pipeline.extras.publish_3dtiles.globe import geodesy, to_globe
-from pipeline.extras.publish_3dtiles.property_table import (
-    BLOCK_COLUMNS,
-    COLUMNS,
-    STORED_TYPES,
-    StoredColumn,
-    stored_column,
-)
+from pipeline.extras.publish_3dtiles.property_table import BLOCK_COLUMNS, COLUMNS, StoredColumn, stored_column
 from pipeline.extras.publish_3dtiles.publishing_3dtiles import publish_3dtiles
 from pipeline.io.crs import SpatialReference
 from pipeline.model import BuildingResult
-from pipeline.runtime.digest import run_digest
-from pipeline.runtime.manifest import RunStatus, write_manifest
+from pipeline.runtime.manifest import write_manifest
 from pipeline.runtime.manifest_reading import read_manifest
 from pipeline.tiling import Tile
 
@@ -253,7 +247,6 @@ def test_the_property_table_holds_every_column_of_the_record(run_dir: Path, tmp_
 
 
 def test_every_type_of_the_records_has_one_and_an_unknown_type_is_an_error() -> None:
-    assert {column.kind for column in COLUMNS} <= set(STORED_TYPES)
     assert [c.name for c in COLUMNS] == [
         n for n in SCHEMAS["buildings"].names if n not in {"geometry", *SHAPE_COLUMNS}
     ] + ["tile"]
@@ -266,7 +259,9 @@ def test_every_type_of_the_records_has_one_and_an_unknown_type_is_an_error() -> 
 
 def test_the_page_says_what_each_type_becomes_and_what_null_is() -> None:
     rows = re.findall(r"^\| `(\w+)` \| `([A-Z][^`]*)` \| (.*) \|$", PAGE.read_text(), re.MULTILINE)
-    assert {kind: stored for kind, stored, _ in rows} == dict(STORED_TYPES)
+    assert {kind: stored for kind, stored, _ in rows} == {
+        kind: types.tiles for kind, types in KINDS.items() if types.tiles != "none"
+    }
     for kind, _, null in rows:
         stored = StoredColumn(name="x", kind=kind, nullable=True).no_data
         assert (str(stored) or "empty text") in null or kind == "bool"
@@ -365,18 +360,6 @@ def test_a_city_opens_with_its_largest_buildings(
                 )
 
 
-def test_the_same_run_gives_the_same_bytes_and_stays_as_it_is(run_dir: Path, tmp_path: Path) -> None:
-    before, digest = files(run_dir), run_digest(str(run_dir))
-    published = publish_3dtiles(str(run_dir), str(tmp_path / "a"))
-    publish_3dtiles(str(run_dir), str(tmp_path / "b"))
-    assert files(tmp_path / "a") == files(tmp_path / "b")
-    assert published.size_bytes == sum(map(len, files(tmp_path / "a").values()))
-    assert published.rows == {"buildings": 4, "models": 3}
-    assert files(run_dir) == before
-    assert run_digest(str(run_dir)) == digest
-    assert {path.name for path in tmp_path.iterdir()} == {"run", "a", "b"}
-
-
 def test_files_say_which_correction_heights_got(run_dir: Path, tmp_path: Path) -> None:
     given = publish_3dtiles(str(run_dir), str(tmp_path / "a"), geoid_height_m=GEOID_M)
     none = publish_3dtiles(str(run_dir), str(tmp_path / "b"))
@@ -430,12 +413,6 @@ def test_a_run_that_cannot_be_published_leaves_nothing(run_dir: Path, tmp_path: 
     path.write_text(text[: len(text) // 2])
     with pytest.raises(RunError, match="cannot be placed on the globe"):
         publish_3dtiles(str(run_dir), str(out))
-    path.unlink()
-    with pytest.raises(RunError, match=r"part-0\.city\.jsonl of the run .* is gone|has 2 rows, but"):
-        publish_3dtiles(str(run_dir), str(out))
-    write_manifest(run_dir, dataclasses.replace(read_manifest(run_dir), status=RunStatus.CANCELLED))
-    with pytest.raises(RunError, match="is cancelled"):
-        publish_3dtiles(str(run_dir), str(out))
     bare = tiled_run(tmp_path / "bare", {"x0_y0": [small.failed()]}, contexts)
     with pytest.raises(RunError, match=r"no building of the run .* has a model"):
         publish_3dtiles(str(bare), str(out))
@@ -454,25 +431,7 @@ def test_only_an_earlier_tileset_is_replaced_and_as_a_whole(run_dir: Path, tmp_p
     (out / "notes.txt").write_text("mine")
     with pytest.raises(RunError, match=r"holds notes\.txt, which is not of a tileset"):
         publish_3dtiles(str(run_dir), str(out), overwrite=True)
-    with pytest.raises(RunError, match="is a file: give the name of a folder"):
-        publish_3dtiles(str(run_dir), str(out / "notes.txt"))
-    with pytest.raises(SettingsError, match="lies in the run directory"):
-        publish_3dtiles(str(run_dir), str(run_dir / "x"))
     assert {path.name for path in tmp_path.iterdir()} == {"run", "out"}
-
-
-def test_a_broken_off_run_leaves_the_old_folder(run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    out = tmp_path / "out"
-    publish_3dtiles(str(run_dir), str(out))
-    before = files(tmp_path)
-
-    def broken(*_: object) -> bytes:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("pipeline.extras.publish_3dtiles.publishing_3dtiles.globe_tileset", broken)
-    with pytest.raises(KeyboardInterrupt):
-        publish_3dtiles(str(run_dir), str(out), overwrite=True)
-    assert files(tmp_path) == before
 
 
 def test_the_tree_is_walked_depth_first_and_holds_few_blocks(monkeypatch: pytest.MonkeyPatch) -> None:

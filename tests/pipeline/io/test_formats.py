@@ -7,8 +7,7 @@ import pytest
 
 from pipeline.errors import EmptyInputError, UnreadableInputError
 from pipeline.io import find_inputs, open_source
-from pipeline.io.formats import recognise_format
-from pipeline.io.source import READERS
+from pipeline.io.formats import FORMATS, recognise_format
 
 
 @pytest.fixture
@@ -86,10 +85,10 @@ def test_a_folder_given_as_a_file_is_reported(tmp_path):
 def test_the_content_decides_and_not_the_name(tmp_path, points, write_las):
     path = write_las(tmp_path / "a.laz", points(10))
     renamed = path.rename(tmp_path / "a.bin")
-    assert recognise_format(renamed) == "las"
+    assert recognise_format(renamed).name == "las"
     table = tmp_path / "points.dat"
     table.write_text("1.0 2.0 3.0\n")
-    assert recognise_format(table) == "ascii"
+    assert recognise_format(table).name == "ascii"
 
 
 @pytest.mark.parametrize(
@@ -119,7 +118,9 @@ def test_every_format_has_its_reader(tmp_path):
     (tmp_path / "a.ply").write_bytes(b"ply\n")
     (tmp_path / "a.xyz").write_text("1 2 3\n")
     (tmp_path / "a.las").write_bytes(b"LASF")
-    assert {recognise_format(tmp_path / f"a.{suffix}") for suffix in ("ply", "xyz", "las")} == set(READERS)
+    assert {recognise_format(tmp_path / f"a.{suffix}").name for suffix in ("ply", "xyz", "las")} == {
+        form.name for form in FORMATS
+    }
 
 
 def test_links_to_one_file_are_one_input(folder):

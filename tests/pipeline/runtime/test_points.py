@@ -12,11 +12,12 @@ import pyarrow.dataset as ds
 import pyproj
 import pytest
 import scipy.spatial
+from points_glb import read_points_glb
 
 from pipeline.extras.classify.classify import ClassifySummary
 from pipeline.extras.octree import tile_points
 from pipeline.extras.octree.building_points import building_points
-from pipeline.extras.octree.point_glb import NO_BUILDING, NO_PLANE, NO_RESIDUAL, ModelledPoints, read_points_glb
+from pipeline.extras.octree.point_glb import NO_BUILDING, NO_PLANE, NO_RESIDUAL, ModelledPoints
 from pipeline.extras.overrides.rerun import RerunRequest, rerun
 from pipeline.quality.residuals import summarise
 from pipeline.quality.roof_returns import roof_returns

@@ -6,7 +6,7 @@ from pathlib import Path
 import pyogrio
 import pytest
 
-from pipeline.extras.publish.publishing import publish_geopackage
+from pipeline.extras.publish_gis.geopackage import publish_geopackage
 from pipeline.runtime.digest import run_digest
 from pipeline.runtime.run import RunSummary
 

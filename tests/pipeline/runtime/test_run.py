@@ -16,7 +16,7 @@ import pipeline.export.tile
 import pipeline.recipe
 from pipeline.errors import BuildingError, EmptyInputError, InconsistentInputError, InputError, RunError
 from pipeline.extras.overrides.rerun import RerunRequest, rerun
-from pipeline.extras.publish.publishing import publish_stac
+from pipeline.extras.publish_stac.stac import publish_stac
 from pipeline.model import Reason
 from pipeline.runtime.digest import run_digest
 from pipeline.runtime.manifest_reading import read_manifest

@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.errors import SettingsError
 from pipeline.methods import METHODS
-from pipeline.parameters import RENAMED
+from pipeline.renamed_settings import RENAMED
 from pipeline.settings import SECTIONS, RunSettings
 
 

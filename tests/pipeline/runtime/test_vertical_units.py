@@ -14,8 +14,9 @@ from las_files import write_las
 
 from pipeline.errors import CrsError
 from pipeline.export.geoparquet import read_table
-from pipeline.extras.publish.publishing import publish_geopackage, publish_pmtiles
 from pipeline.extras.publish_3dtiles.publishing_3dtiles import publish_3dtiles
+from pipeline.extras.publish_gis.geopackage import publish_geopackage
+from pipeline.extras.publish_gis.pmtiles import publish_pmtiles
 from pipeline.extras.terrain_tin.terrain_files import read_terrain
 from pipeline.io import ReadOptions, arrow_at
 from pipeline.io.crs import vertical_unit_of

@@ -62,7 +62,7 @@ class Site:
 
     def submit(self) -> Job:
         request = JobRequest(tiles=(InputReference(kind="path", value=str(self.tile)),))
-        return self.store.create(request, owner=None, max_queued=100, max_queued_per_key=100)
+        return self.store.create(request, owner=None)
 
     def statuses(self, job: Job) -> list[JobStatus]:
         return [event.status for event in self.store.events(job.job_id) if event.status is not None]

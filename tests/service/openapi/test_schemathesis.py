@@ -117,7 +117,7 @@ class Ids:
     def _waiting(self) -> str:
         tile = finished_runs.InputReference(kind="path", value="/srv/tile.laz")
         request = finished_runs.JobRequest(tiles=(tile,))
-        return self._service.store.create(request, owner=None, max_queued=10**6, max_queued_per_key=10**6).job_id
+        return self._service.store.create(request, owner=None).job_id
 
     def put_into(self, case: Any, mode: GenerationMode) -> None:
         parameters = case.path_parameters or {}

@@ -43,7 +43,7 @@ def test_a_first_job_shows_what_is_compiled_before_its_other_stages(
     url, state = driverless
     with JobStore(ServiceSettings(state=state).database) as store:
         request = JobRequest(tiles=(InputReference(kind="path", value="/srv/tile.laz"),), title="the first")
-        store.create(request, owner=None, max_queued=9, max_queued_per_key=9)
+        store.create(request, owner=None)
         job = claimed(store)
         page = visit(url).page
         page.goto(f"{url}#/jobs/{job.job_id}")
@@ -72,7 +72,7 @@ def test_outlines_come_as_buildings_are_modelled_and_begin_anew_with_an_attempt(
     folder = StateFolder(state)
     with JobStore(ServiceSettings(state=state).database) as store:
         request = JobRequest(tiles=(InputReference(kind="path", value="/srv/tile.laz"),), title="a town")
-        store.create(request, owner=None, max_queued=9, max_queued_per_key=9)
+        store.create(request, owner=None)
         job = claimed(store)
         folder.attempt(job.job_id, 1).mkdir(parents=True)
         running = RunningRun(folder.run(job.job_id, 1))

@@ -1,27 +1,29 @@
 /** The figures and marks of a record by which the list is sorted and filtered. */
 
-import { COLUMNS, shown, type ColumnName } from "./columns";
+import { COLUMNS, shown } from "./columns";
 
 interface Figure {
   label: string;
   /** The column of the record, and that of a rejected object if it has another name. */
-  column: ColumnName;
+  column: string;
   ofRejected?: string;
   /** Decimals; those of the column if none are given. */
   digits?: number;
 }
 
+const labelOf = (column: string): string => COLUMNS[column]?.label ?? column;
+
 export const FIGURES = {
   height: { label: "Height", column: "height_m", digits: 1 },
   area: { label: "Area", column: "footprint_area_m2", ofRejected: "area_m2", digits: 0 },
-  within: { label: COLUMNS.share_within_0_2m.label, column: "share_within_0_2m" },
+  within: { label: labelOf("share_within_0_2m"), column: "share_within_0_2m" },
   residual: { label: "Residual (RMSE)", column: "rmse_m" },
   planes: { label: "Roof faces", column: "n_planes" },
   confidence: { label: "Confidence", column: "detection_confidence" },
-  volume: { label: COLUMNS.volume_m3.label, column: "volume_m3" },
-  points: { label: COLUMNS.n_points.label, column: "n_points" },
+  volume: { label: labelOf("volume_m3"), column: "volume_m3" },
+  points: { label: labelOf("n_points"), column: "n_points" },
   density: { label: "Points per m²", column: "density_per_m2" },
-  coverage: { label: COLUMNS.coverage.label, column: "coverage" },
+  coverage: { label: labelOf("coverage"), column: "coverage" },
 } as const satisfies Record<string, Figure>;
 
 export type FigureName = keyof typeof FIGURES;

@@ -5,9 +5,16 @@ import type { InputDescription } from "../api/types";
 import { levelsOffered, levelWords, lodsInput } from "../models/levels_of_detail";
 import { el } from "../page/elements";
 import { Boxes, choice, field } from "../page/form_fields";
-import { FORMATS, LABELS } from "../words/fields";
+import { TABLES } from "../words/tables";
 
+const LABELS = TABLES.inputs;
 const VERTICAL_UNITS = { "": "as in the file", m: "metres", ft: "feet", "us-ft": "US survey feet" };
+
+/** Inputs with a field of their own, or without one; all others get a field by their type. */
+const KNOWN = new Set([
+  "tiles", "footprints", "footprintsLayer", "guides", "crs", "verticalUnit", "allowOutsideAreaOfUse", "method", "preset", "lods", "classes",
+  "points", "publish", "settings", "title",
+]);
 
 /** What the options make of a job. */
 export interface Asked {
@@ -32,6 +39,10 @@ export class Options {
   private readonly classes = choice("classes", {});
   private readonly points = checkbox("with-points", LABELS.points, "To see them over the models, with their distances to the roofs. Takes longer.");
   private readonly formats = new Boxes();
+  /** The fields of all other inputs, and the value of each that is set. */
+  private readonly further = el("div");
+  private readonly values = new Map<string, () => string | boolean>();
+  private ofComparison = new Set<string>();
   private readonly title = el("input", { id: "title", type: "text", autocomplete: "off", maxlength: 200 });
 
   /**
@@ -55,6 +66,7 @@ export class Options {
       ...guides,
       this.points.element,
       group(LABELS.publish, this.formats),
+      this.further,
       field(LABELS.title, this.title),
     );
     for (const control of [this.method, this.preset, this.levels.element, this.others.element, this.anywhere.box]) {
@@ -74,8 +86,10 @@ export class Options {
     const lods = inputs["lods"]?.schema;
     const level = (value: string): string => `LoD${value}: ${levelWords(value)}`;
     this.levels.offer(labelled(levelsOffered(lods?.enum ?? []), level), levelsOffered([String(lods?.default ?? "")]));
-    this.formats.offer(labelled(inputs["publish"]?.schema.items?.enum ?? [], (value) => FORMATS[value] ?? value));
+    this.formats.offer(labelled(inputs["publish"]?.schema.items?.enum ?? [], (value) => TABLES.formats[value] ?? value));
+    for (const [name, described] of Object.entries(inputs)) if (!KNOWN.has(name)) this.addField(name, described);
     const comparison = await getJson<{ inputs: Record<string, InputDescription> }>("processes/compare");
+    this.ofComparison = new Set(Object.keys(comparison.inputs));
     const variants = comparison.inputs["methods"]?.schema.items?.enum ?? [];
     const named = variants.filter((variant) => !variant.endsWith(`:${this.usualPreset}`));
     this.others.offer(labelled(named, (value) => value.replace(":", ", ")));
@@ -114,6 +128,10 @@ export class Options {
       if (this.formats.chosen.length > 0) inputs["publish"] = this.formats.chosen;
     }
     for (const [name, value] of chosen) if (value !== "") inputs[name] = value;
+    for (const [name, valueOf] of this.values) {
+      const value = valueOf();
+      if (value !== "" && value !== false && (variants.length === 1 || this.ofComparison.has(name))) inputs[name] = value;
+    }
     if (this.anywhere.box.checked) inputs["allowOutsideAreaOfUse"] = true;
     return { process: variants.length > 1 ? "compare" : "reconstruct", inputs };
   }
@@ -141,6 +159,24 @@ export class Options {
   clear(): void {
     this.layer.value = this.title.value = "";
     this.anywhere.box.checked = false;
+  }
+
+  /** A field for an input that needs none of its own: a permission, a word of several, or a text. */
+  private addField(name: string, { title = name, description = "", schema }: InputDescription): void {
+    const id = `option-${name}`;
+    if (schema.type === "boolean") {
+      const { box, element } = checkbox(id, title, description);
+      this.further.append(element);
+      this.values.set(name, () => box.checked);
+    } else if (schema.enum !== undefined) {
+      const words = choice(id, labelled(schema.enum, (word) => word), String(schema.default));
+      this.further.append(field(title, words, description));
+      this.values.set(name, () => (words.value === schema.default ? "" : words.value));
+    } else if (schema.type === "string") {
+      const text = el("input", { id, type: "text", autocomplete: "off" });
+      this.further.append(field(title, text, description));
+      this.values.set(name, () => text.value.trim());
+    }
   }
 
   private get chosen(): string {

@@ -4,13 +4,10 @@ import { sendJson, type Problem } from "../api/requests";
 import { el, svg } from "../page/elements";
 import { field } from "../page/form_fields";
 import { announce, asProblem, problemNotice } from "../page/notices";
-import { LABELS } from "../words/fields";
+import { TABLES } from "../words/tables";
 import { Options } from "./options";
 import { SentFile, texts } from "./sent_file";
 import { Unfinished } from "./unfinished";
-
-const TILE_ENDINGS = ".las,.laz,.ply,.xyz,.txt,.csv,.asc,.pts";
-const VECTOR_ENDINGS = ".gpkg,.geojson,.json,.geojsonl,.geojsons,.ndjson,.parquet,.geoparquet,.fgb,.gml,.kml,.zip,.kmz";
 
 /** Inputs that are one vector file each. */
 const VECTORS = ["footprints", "guides"] as const;
@@ -38,7 +35,7 @@ export class Submission {
     private readonly onSubmitted: (jobId: string) => void,
     private readonly onProblem: (problem: Problem) => void,
   ) {
-    const picker = el("input", { type: "file", id: "tiles", multiple: true, accept: TILE_ENDINGS, class: "visually-hidden" });
+    const picker = el("input", { type: "file", id: "tiles", multiple: true, accept: TABLES.endings.tiles, class: "visually-hidden" });
     picker.addEventListener("change", () => {
       this.addTiles([...(picker.files ?? [])]);
       picker.value = "";
@@ -48,7 +45,7 @@ export class Submission {
       { class: "drop", for: "tiles" },
       svg("svg", { viewBox: "0 0 24 24", "aria-hidden": "true" }, svg("path", { d: "M12 16V4m-5 5 5-5 5 5M4 16v4h16v-4" })),
       el("span", { class: "drop-title" }, "Drop tiles here"),
-      el("span", { class: "hint" }, "or choose files: LAS, LAZ, COPC, PLY, xyz"),
+      el("span", { class: "hint" }, `or choose files: ${TABLES.endings.tiles.replaceAll(",", " ")}`),
     );
     this.takeDrops(zone);
     this.options = new Options(
@@ -107,13 +104,13 @@ export class Submission {
 
   /** The field for the file of an input, and the place of its row. */
   private vectorField(name: Vector, hint: string): HTMLElement[] {
-    const picker = el("input", { type: "file", id: name, accept: VECTOR_ENDINGS });
+    const picker = el("input", { type: "file", id: name, accept: TABLES.endings.vectors });
     picker.addEventListener("change", () => {
       const file = picker.files?.[0];
       if (file !== undefined) this.setVector(name, file);
       picker.value = "";
     });
-    return [field(LABELS[name], picker, hint), this.vectorRows[name]];
+    return [field(TABLES.inputs[name], picker, hint), this.vectorRows[name]];
   }
 
   private setVector(name: Vector, file: File): void {

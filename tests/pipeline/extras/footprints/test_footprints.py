@@ -152,16 +152,6 @@ def test_other_geometries_are_left_out_and_reported(tmp_path):
         read_footprints(lines, reference())
 
 
-def test_several_layers_must_be_named(tmp_path):
-    path = write(tmp_path / "a.gpkg", layer="houses")
-    write(path, [HOUSES[0]], layer="sheds")
-    with pytest.raises(UnreadableInputError, match=r"2 layers could be.*houses, sheds"):
-        read_footprints(path, reference())
-    assert len(read_footprints(path, reference(), layer="sheds")) == 1
-    with pytest.raises(UnreadableInputError, match="'barns' is not there"):
-        read_footprints(path, reference(), layer="barns")
-
-
 def test_a_layer_of_points_beside_does_not_disturb(tmp_path):
     path = write(tmp_path / "a.gpkg", layer="houses")
     write(path, [Point(0, 0)], layer="trees")

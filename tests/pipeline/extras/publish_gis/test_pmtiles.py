@@ -13,20 +13,18 @@ import pyproj
 import pytest
 import shapely
 from column_values import rows
-from command_line import invoke
 from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from small_runs import content, restated, write_run, write_whole_run
 from vector_tile import Feature, layers_of
 
-from pipeline.errors import RunError, SettingsError
+from pipeline.errors import RunError
 from pipeline.export.columns import COLUMNS, KINDS, TILE_COLUMN, kind_of
 from pipeline.export.geoparquet import read_table
 from pipeline.export.projection import projection_to
-from pipeline.extras.publish.publishing import publish_pmtiles
 from pipeline.extras.publish_gis import pmtiles
-from pipeline.runtime.manifest import RunStatus
+from pipeline.extras.publish_gis.pmtiles import publish_pmtiles
 
 RD = {"wkt": pyproj.CRS.from_epsg(28992).to_wkt()}
 BUILDINGS = {column.name: column for column in COLUMNS["buildings"]}
@@ -65,7 +63,6 @@ def written(value: Any, name: str) -> Any:
 def test_every_column_is_a_property_of_the_documented_type(
     data: st.DataObject, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    assert tuple(pmtiles.PROPERTY_TYPES) == KINDS
     schema = pa.schema([pa.field(name, BUILDINGS[name].kind) for name in pmtiles.READ])
     drawn = data.draw(st.lists(rows(schema, pmtiles.READ), max_size=4))
     drawn = [row | {"building_id": f"b{number}"} for number, row in enumerate(drawn)]
@@ -92,7 +89,7 @@ def test_every_column_is_a_property_of_the_documented_type(
     types = {"string": str, "bool": bool, "int": int, "double": int | float}
     for properties in found.values():
         for name in properties.keys() - {TILE_COLUMN.name}:
-            kind = pmtiles.PROPERTY_TYPES[kind_of(BUILDINGS[name].kind)].split(",")[0]
+            kind = KINDS[kind_of(BUILDINGS[name].kind)].pmtiles.split(",")[0]
             assert isinstance(properties[name], types[kind]), name
 
 
@@ -167,19 +164,6 @@ def test_header_and_metadata_lead_a_map_to_the_data(run_dir: Path, tmp_path: Pat
     assert set(layer["fields"]) == set(pmtiles.SCHEMA.names) - {"geometry"}
 
 
-def test_the_same_run_gives_the_same_bytes_and_is_replaced_only_where_asked(run_dir: Path, tmp_path: Path) -> None:
-    first, second = tmp_path / "run.pmtiles", tmp_path / "other" / "new!.pmtiles"
-    for path in (first, second):
-        publish_pmtiles(str(run_dir), str(path))
-    assert first.read_bytes() == second.read_bytes()
-    first.write_text("of before")
-    with pytest.raises(RunError, match=r"run\.pmtiles exists already.*--overwrite"):
-        publish_pmtiles(str(run_dir), str(first))
-    assert first.read_text() == "of before"
-    publish_pmtiles(str(run_dir), str(first), overwrite=True)
-    assert first.read_bytes() == second.read_bytes()
-
-
 def test_of_too_many_buildings_the_largest_stay_and_the_last_zoom_has_all(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -219,18 +203,10 @@ def test_long_attributes_do_not_make_coordinates_coarse(tmp_path: Path, monkeypa
     assert {extent for extent, _ in places.values()} == {4096}
 
 
-def test_what_cannot_be_a_map_is_refused(run_dir: Path, tmp_path: Path) -> None:
+def test_a_run_without_a_crs_is_refused(run_dir: Path, tmp_path: Path) -> None:
     out = tmp_path / "run.pmtiles"
-    with pytest.raises(SettingsError, match=r"ends in \.gpkg: give a name that ends in \.pmtiles"):
-        publish_pmtiles(str(run_dir), str(tmp_path / "run.gpkg"))
-    restated(run_dir, status=RunStatus.RUNNING)
-    with pytest.raises(RunError, match="is running, not finished"):
-        publish_pmtiles(str(run_dir), str(out))
-    restated(run_dir, status=RunStatus.FINISHED, counts={"candidates": 5})
-    with pytest.raises(RunError, match=r"has 4 rows, but run\.json counts 5"):
-        publish_pmtiles(str(run_dir), str(out))
     for crs in (None, {"wkt": None}):
-        restated(run_dir, crs=crs, counts={})
+        restated(run_dir, crs=crs)
         with pytest.raises(RunError, match=r"the CRS of the run is unknown.*--crs"):
             publish_pmtiles(str(run_dir), str(out))
     assert not out.exists()
@@ -242,8 +218,3 @@ def test_a_run_without_buildings_is_refused(tmp_path: Path) -> None:
     with pytest.raises(RunError, match="no building with a footprint"):
         publish_pmtiles(str(run_dir), str(tmp_path / "run.pmtiles"))
     assert list(tmp_path.iterdir()) == [run_dir]
-
-
-def test_the_command_writes_pmtiles(run_dir: Path, tmp_path: Path) -> None:
-    code, said, _ = invoke("publish", str(run_dir), "--as", "pmtiles", "--out", str(tmp_path / "a.pmtiles"), "--json")
-    assert (code, json.loads(said)["rows"]) == (0, {"buildings": 4})

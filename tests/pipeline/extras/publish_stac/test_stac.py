@@ -12,21 +12,20 @@ import pyproj
 import pystac
 import pytest
 import shapely
-from command_line import invoke
 from pystac.extensions.pointcloud import PointcloudExtension
 from pystac.extensions.projection import ProjectionExtension
 from pystac.extensions.table import TableExtension
 from pystac.validation.stac_validator import JsonSchemaSTACValidator
 from small_runs import content, restated, write_run, write_whole_run
 
-from pipeline.errors import RunError, SettingsError
+from pipeline.errors import RunError
 from pipeline.export.columns import COLUMNS
 from pipeline.export.geoparquet import read_table
-from pipeline.export.projection import projection_to
-from pipeline.extras.publish.publishing import publish_stac
+from pipeline.export.projection import Project, projection_to
 from pipeline.extras.publish_stac import stac
+from pipeline.extras.publish_stac.stac import publish_stac
 from pipeline.io import storage_at
-from pipeline.runtime.manifest import InputFile, PointFileFacts, RunStatus
+from pipeline.runtime.manifest import InputFile, PointFileFacts, RunManifest, RunStatus
 
 RD = {"wkt": pyproj.CRS.from_epsg(7415).to_wkt(), "epsg": 7415, "horizontal_unit_m": 1.0, "vertical_unit_m": 1.0}
 MADE = dt.datetime(2026, 1, 1, 2, tzinfo=dt.UTC)
@@ -38,6 +37,21 @@ def run_dir(tmp_path: Path) -> Path:
     run = write_whole_run(tmp_path / "my models")
     restated(run, crs=RD, finished_at=MADE, source_licence="CC-BY-4.0", tiles=("t1", "t2"))
     return run
+
+
+def catalogued(project: Project = lambda xy: xy) -> stac.Run:
+    """A run whose places are degrees."""
+    manifest = RunManifest(
+        status=RunStatus.FINISHED,
+        engine_version="1",
+        method="m",
+        settings={},
+        settings_hash="",
+        started_at=MADE,
+        finished_at=MADE,
+        crs=RD,
+    )
+    return stac.Run(name="r", manifest=manifest, project=project)
 
 
 def validated(path: Path) -> dict[str, Any]:
@@ -114,12 +128,12 @@ def test_times_are_those_of_the_points_and_else_that_of_the_run(run_dir: Path, t
     unknown = pystac.Item.from_file(str(tmp_path / "out" / "t1" / "t1.json"))
     assert (unknown.datetime, unknown.properties["processing:datetime"]) == (MADE, "2026-01-01T02:00:00Z")
     start, end = dt.datetime(2020, 5, 1, tzinfo=dt.UTC), dt.datetime(2020, 5, 2, 1, 2, 3, 4, tzinfo=dt.UTC)
-    run = stac.Run(name="r", version="1", method="m", finished_at=MADE, licence=None, crs=RD)
+    run = catalogued()
     tile = stac.TileFacts(key="t", files={}, bounds=(0.0, 0.0, 1.0, 1.0), acquired=(start, end), rows={})
-    known = stac.item(tile, run, lambda xy: xy, "")["properties"]
+    known = stac.item(tile, run, "")["properties"]
     assert (known["datetime"], known["start_datetime"]) == (None, "2020-05-01T00:00:00Z")
     assert known["end_datetime"] == "2020-05-02T01:02:03.000004Z"
-    later = stac.item(tile, run, lambda xy: xy, "") | {"id": "u"}
+    later = stac.item(tile, run, "") | {"id": "u"}
     collection = stac.collection(run, [later], [], "")
     assert collection["extent"]["temporal"]["interval"] == [[known["start_datetime"], known["end_datetime"]]]
     bare = dataclasses.replace(tile, acquired=None)
@@ -136,7 +150,7 @@ def test_times_are_compared_as_times_not_as_texts() -> None:
     """As a text, half a second after comes before."""
     at = ("2020-05-01T00:00:00Z", "2020-05-01T00:00:00.500000Z")
     items = [{"id": text, "bbox": [0.0, 0.0, 1.0, 1.0], "properties": {"datetime": text}} for text in at]
-    run = stac.Run(name="r", version="1", method="m", finished_at=MADE, licence=None, crs=RD)
+    run = catalogued()
     assert stac.collection(run, items, [], "")["extent"]["temporal"]["interval"] == [list(at)]
 
 
@@ -183,9 +197,8 @@ def test_a_place_that_is_not_on_the_earth_is_refused(run_dir: Path, tmp_path: Pa
 @pytest.mark.parametrize("flip", [1.0, -1.0])
 @pytest.mark.parametrize("size", [0.0, 1e-9, 3e-8, 1e-3])
 def test_rings_are_counterclockwise_and_never_empty(flip: float, size: float) -> None:
-    run = stac.Run(name="r", version="1", method="m", finished_at=MADE, licence=None, crs=RD)
     tile = stac.TileFacts(key="t", files={}, bounds=(5.0, 50.0, 5.0 + size, 50.0), acquired=None, rows={})
-    item = stac.item(tile, run, lambda xy: xy * (flip, 1.0), "")
+    item = stac.item(tile, catalogued(lambda xy: xy * (flip, 1.0)), "")
     place = shapely.geometry.shape(item["geometry"])
     assert place.is_valid
     assert place.area > 0.0
@@ -194,11 +207,11 @@ def test_rings_are_counterclockwise_and_never_empty(flip: float, size: float) ->
 
 
 def test_a_tile_across_180_deg_is_split_there() -> None:
-    run = stac.Run(name="r", version="1", method="m", finished_at=MADE, licence=None, crs=RD)
+    run = catalogued(lambda xy: np.where(xy > 180.0, xy - 360.0, xy))
     items = []
     for west, east in ((179.5, 180.25), (180.0, 180.5), (179.0, 179.5)):
         tile = stac.TileFacts(key="t", files={}, bounds=(west, -17.0, east, -16.0), acquired=None, rows={})
-        items.append(stac.item(tile, run, lambda xy: np.where(xy > 180.0, xy - 360.0, xy), ""))
+        items.append(stac.item(tile, run, ""))
     assert items[0]["bbox"] == [179.5, -17.0, -179.75, -16.0]
     parts = shapely.geometry.shape(items[0]["geometry"]).geoms
     assert [part.bounds for part in parts] == [(179.5, -17.0, 180.0, -16.0), (-180.0, -17.0, -179.75, -16.0)]
@@ -271,17 +284,8 @@ def test_a_catalogue_is_replaced_only_where_asked_and_never_another_one(run_dir:
 
 def test_what_cannot_be_listed_is_refused(run_dir: Path, tmp_path: Path) -> None:
     out = str(tmp_path / "out")
-    with pytest.raises(SettingsError, match="lies in the run directory"):
-        publish_stac(str(run_dir), str(run_dir / "out"))
-    restated(run_dir, status=RunStatus.CANCELLED)
-    with pytest.raises(RunError, match="is cancelled, not finished"):
-        publish_stac(str(run_dir), out)
-    restated(run_dir, status=RunStatus.FINISHED, crs=None)
+    restated(run_dir, crs=None)
     with pytest.raises(RunError, match="the CRS of the run is unknown"):
-        publish_stac(str(run_dir), out)
-    restated(run_dir, crs=RD)
-    (run_dir / "cityjson" / "tile=t2" / "part-0.city.jsonl").unlink()
-    with pytest.raises(RunError, match=r"tile=t2/part-0\.city\.jsonl of the run .* is gone"):
         publish_stac(str(run_dir), out)
     without_states = write_run(tmp_path / "run", [])
     restated(without_states, crs=RD)
@@ -379,8 +383,3 @@ def test_the_points_of_another_run_are_kept(run_dir: Path, tmp_path: Path) -> No
     restated(run_dir, inputs=(_input("tile.laz", sha256="cd" * 32),))
     with pytest.raises(RunError, match=r"holds points/tile-abababab\.json, which is not of this run"):
         publish_stac(str(run_dir), str(tmp_path / "out"), overwrite=True)
-
-
-def test_the_command_writes_a_catalogue(run_dir: Path, tmp_path: Path) -> None:
-    code, said, _ = invoke("publish", str(run_dir), "--as", "stac", "--out", str(tmp_path / "out"), "--json")
-    assert (code, json.loads(said)["rows"]) == (0, {"items": 2, "points": 0})

@@ -12,8 +12,9 @@ from shapely import LineString, box
 
 from pipeline.errors import CrsError, EmptyInputError, UnreadableInputError
 from pipeline.extras.footprints.footprints_file import read_area, read_footprints
-from pipeline.extras.footprints.placed_features import Elsewhere, off_the_data
+from pipeline.extras.footprints.placed_features import off_the_data
 from pipeline.extras.guides.guides_file import read_guides
+from pipeline.extras.vector_files.nearby import Elsewhere
 from pipeline.extras.vector_files.tile_index import read_tile_index
 from pipeline.io import SpatialReference
 from pipeline.io.crs_resolution import resolve_reference
