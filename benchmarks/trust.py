@@ -48,7 +48,8 @@ from pipeline.model import Status
 from pipeline.ruler.evaluation.reading import read_models
 from pipeline.ruler.simulation.dataset import simulate
 from pipeline.ruler.simulation.seeds import seed_of
-from pipeline.ruler.simulation.trust import CELLS, KINDS, TrustCell
+from pipeline.ruler.simulation.sweep import Cell
+from pipeline.ruler.simulation.trust import CELLS, KINDS
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.resources import SERIAL
 from pipeline.runtime.run import run
@@ -62,7 +63,7 @@ FITTED_SHARE = 0.9
 SURVEYS_IN_FEET = ("d4_five", "d6_last")
 
 
-def tolerance_of(cell: TrustCell) -> float:
+def tolerance_of(cell: Cell) -> float:
     """The vertical tolerance of a survey."""
     return SPARSE_TOLERANCE_M if cell.density_per_m2 < SPARSE_PER_M2 else TOLERANCE_M
 
@@ -89,7 +90,7 @@ class Judged:
 
 
 def judge_run(
-    models_dir: Path, truth_dir: Path, cell: TrustCell, classes: str, draw: int, *, in_feet: bool = False
+    models_dir: Path, truth_dir: Path, cell: Cell, classes: str, draw: int, *, in_feet: bool = False
 ) -> Judged:
     """Hold a run directory against the truth of its scene."""
     truth = Truth(read_models(truth_dir).models)
@@ -175,7 +176,7 @@ def write_in_feet(metres: Path, feet: Path) -> None:
     copy.write(feet)
 
 
-def run_cell(task: tuple[TrustCell, Path, int, bool]) -> list[Judged]:
+def run_cell(task: tuple[Cell, Path, int, bool]) -> list[Judged]:
     """Model a scene with its classes ignored, and trusted if it has any, and judge both; the last says: in feet."""
     cell, place, draw, in_feet = task
     found = []

@@ -76,7 +76,7 @@ FORMATS = (
     ),
 )
 """All formats of points, those with first bytes of their own first."""
-LAS, _, ASCII = FORMATS
+LAS, ASCII = FORMATS[0], FORMATS[-1]
 ENCODINGS: Mapping[str, tuple[str, str]] = {name: words for form in FORMATS for name, words in form.encodings.items()}
 """The encoding and the media type of each `FileFacts.format` in STAC."""
 DIVISIBLE = frozenset(name for form in FORMATS if form.has_parts for name in form.encodings)

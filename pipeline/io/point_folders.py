@@ -1,4 +1,4 @@
-"""The point files of a folder."""
+"""The point files of a folder, on this machine or in a bucket."""
 
 from __future__ import annotations
 

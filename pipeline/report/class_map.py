@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ import pyarrow.compute as pc
 import shapely
 
 from pipeline.model import FloatArray
-from pipeline.report.maps import Entry, Layer, Map, draw_map
+from pipeline.report.maps import Entry, Map, draw_map
 
 MAX_DRAWN, MAX_ORDINARY = 30_000, 20_000
 """Most footprints that are drawn: the largest ones that are not ordinary; ordinary ones beyond this become cells."""
@@ -27,25 +27,12 @@ ROWS = pa.schema([("class", pa.string()), ("geometry", pa.binary()), ("size", pa
 """Columns of a part of the map: class, footprint as WKB, size by which the rows are ordered, name of the row."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class MapClass:
-    """One class."""
-
-    name: str
-    """Its name in the rows."""
-    label: str
-    """Its label in the legend."""
-    colour: str
-    """As #rrggbb."""
-    hatched: bool = False
-    """Whether it is hatched."""
-
-
 class ClassMap:
-    """A map by classes: `others` are drawn over `ordinary`, the most important one last."""
+    """A map by classes, each with its name in the rows: all others are drawn over the first one, the last on top."""
 
-    def __init__(self, title: str, ordinary: MapClass, others: Sequence[MapClass]) -> None:
-        self._title, self._ordinary, self._others = title, ordinary, tuple(others)
+    def __init__(self, title: str, classes: Mapping[str, Entry]) -> None:
+        self._title, self._classes = title, dict(classes)
+        self._ordinary = next(iter(classes))
         self._drawn: list[pa.Table] = []
         self._beneath: list[Any] = []
         self._middles: list[FloatArray] = []
@@ -58,7 +45,7 @@ class ClassMap:
 
     def add(self, rows: pa.Table) -> None:
         """Add a part with the columns of `ROWS`."""
-        is_ordinary = pc.equal(rows["class"], self._ordinary.name)
+        is_ordinary = pc.equal(rows["class"], self._ordinary)
         drawn = rows.filter(pc.invert(is_ordinary))
         self._count.update(drawn["class"].to_pylist())
         self._drawn.append(drawn)
@@ -84,16 +71,23 @@ class ClassMap:
 
     def map(self, unit_m: float) -> Map | None:
         """The map, given metres per unit of the geometries; None without geometry."""
-        layers = []
+        shown: dict[str, Any] = {}
         if self.ordinary:
-            layers.append(_layer(self._ordinary, self._cells_or_footprints(), self.ordinary, unit_m))
+            self._count[self._ordinary] = self.ordinary
+            shown[self._ordinary] = self._cells_or_footprints()
         if self._drawn:
             table = self._largest()
-            for one in self._others:
-                rows = table.filter(pc.equal(table["class"], one.name))["geometry"].to_pylist()
-                geometries = shapely.from_wkb(np.array(rows, dtype=object))
-                if len(geometries):
-                    layers.append(_layer(one, geometries, self._count[one.name], unit_m))
+            for name in [*self._classes][1:]:
+                rows = table.filter(pc.equal(table["class"], name))["geometry"].to_pylist()
+                shown[name] = shapely.from_wkb(np.array(rows, dtype=object))
+        layers = [
+            dataclasses.replace(
+                self._classes[name],
+                count=self._count[name],
+                geometries=shapely.transform(geometries, lambda xy: xy * unit_m).tolist(),
+            )
+            for name, geometries in shown.items()
+        ]
         return draw_map(self._title, layers)
 
     def _cells_or_footprints(self) -> Any:
@@ -106,10 +100,3 @@ class ClassMap:
         cells = np.unique(np.floor((middles - low) / side).astype(np.int64), axis=0)
         corner = low + cells * side
         return shapely.box(corner[:, 0], corner[:, 1], corner[:, 0] + side, corner[:, 1] + side)
-
-
-def _layer(kind: MapClass, geometries: Any, count: int, unit_m: float) -> Layer:
-    if unit_m != 1.0:
-        geometries = shapely.transform(geometries, lambda xy: xy * unit_m)
-    entry = Entry(label=kind.label, colour=kind.colour, count=count, hatched=kind.hatched)
-    return Layer(entry=entry, geometries=list(geometries), filled=not kind.hatched)

@@ -36,18 +36,15 @@ NO_FIGURE = "-"
 """Shown for a missing figure."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
+@dataclasses.dataclass(frozen=True)
 class Entry:
-    """A line of a legend."""
+    """A line of a legend, and the polygons that have its colour, or are hatched with it."""
 
     label: str
-    """Label."""
     colour: str
-    """As #rrggbb."""
-    count: int
-    """Number."""
+    count: int = 0
     hatched: bool = False
-    """Whether it is hatched."""
+    geometries: Sequence[Any] = ()
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -55,21 +52,13 @@ class Map:
     """A map with its words."""
 
     title: str
-    """Title."""
     png: bytes
-    """The picture."""
     width_px: int
-    """Its width."""
     height_px: int
-    """Its height."""
     legend: tuple[Entry, ...]
-    """Meanings of the colours that occur."""
     is_half: bool
-    """Whether half the width of a page is enough."""
     scale_label: str
-    """Length of the scale bar."""
     scale_share: float
-    """That length as a share of the picture's width."""
 
     @property
     def description(self) -> str:
@@ -77,19 +66,7 @@ class Map:
         return f"Map: {self.title}. " + ", ".join(f"{entry.label}: {entry.count:,}" for entry in self.legend) + "."
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Layer:
-    """Polygons of one colour."""
-
-    entry: Entry
-    """Its line of the legend."""
-    geometries: Sequence[Any]
-    """Polygons."""
-    filled: bool = True
-    """False: outlines with a hatch."""
-
-
-def draw_map(title: str, layers: Sequence[Layer]) -> Map | None:
+def draw_map(title: str, layers: Sequence[Entry]) -> Map | None:
     """A map of the layers, later ones over earlier ones; None if they are empty."""
     drawn = [layer for layer in layers if layer.geometries]
     everything = [geometry for layer in drawn for geometry in layer.geometries if geometry is not None]
@@ -112,24 +89,24 @@ def draw_map(title: str, layers: Sequence[Layer]) -> Map | None:
         png=png_of(figure),
         width_px=width_px,
         height_px=height_px,
-        legend=tuple(layer.entry for layer in drawn),
+        legend=tuple(dataclasses.replace(layer, geometries=()) for layer in drawn),
         is_half=is_half,
         scale_label=f"{length_m / 1000.0:g} km" if length_m >= 1000.0 else f"{length_m:g} m",
         scale_share=length_m / width_m,
     )
 
 
-def _draw_layer(axes: Axes, layer: Layer, *, is_small: bool, zorder: int) -> None:
-    colour = layer.entry.colour
-    edge = colour if is_small or not layer.filled else _EDGE
+def _draw_layer(axes: Axes, layer: Entry, *, is_small: bool, zorder: int) -> None:
+    colour = layer.colour
+    edge = colour if is_small or layer.hatched else _EDGE
     drawn = PathCollection(
         paths_of(layer.geometries),
-        facecolors=colour if layer.filled else "none",
+        facecolors="none" if layer.hatched else colour,
         edgecolors=edge,
-        linewidths=1.5 if not layer.filled else 1.0 if is_small else 0.8,
+        linewidths=1.5 if layer.hatched else 1.0 if is_small else 0.8,
         zorder=zorder,
     )
-    if not layer.filled:
+    if layer.hatched:
         drawn.set_hatch("//////" if is_small else "///")
     axes.add_collection(drawn, autolim=False)
 

@@ -37,7 +37,6 @@ class ViewedFace:
     rings: tuple[FloatArray, ...]
     """Outer ring and holes, each (n, 3) metres, oriented as seen from outside."""
     colour: str
-    """Its colour in full light."""
 
     def about(self, origin: FloatArray) -> ViewedFace:
         """The same face about an origin (3,)."""
@@ -51,7 +50,6 @@ class View:
     azimuth_deg: float = 200.0
     """Direction from the scene to the eye, clockwise from north."""
     altitude_deg: float = 42.0
-    """Angle of the line of sight above the horizon."""
 
 
 def lambert(normal: Sequence[float] | FloatArray, sun_deg: tuple[float, float]) -> float:

@@ -33,7 +33,8 @@ def blank(width_px: int, height_px: int) -> tuple[Figure, Axes]:
 def set_frame(axes: Axes, places: FloatArray) -> float:
     """Show all places (n, 2) with a margin, at one scale in both directions; returns the shown width."""
     low, high = places.min(axis=0), places.max(axis=0)
-    width_px, height_px = axes.figure.get_size_inches()
+    shape: Any = axes.figure
+    width_px, height_px = map(float, shape.get_size_inches())
     size = np.maximum(high - low, 1.0) * (1.0 + 2.0 * _MARGIN)
     width = max(float(size[0]), float(size[1]) * width_px / height_px)
     (x, y), half = (low + high) / 2.0, width * height_px / width_px / 2.0

@@ -18,8 +18,8 @@ from pipeline.export.geoparquet import table_dataset
 from pipeline.io import arrow_at, storage_at
 from pipeline.model import Reason, Status
 from pipeline.reasons import REASONS
-from pipeline.report.class_map import MAX_DRAWN, ROWS, ClassMap, MapClass
-from pipeline.report.maps import BAD, DOUBTFUL, FAIR, GOOD, MISSING, NO_FIGURE
+from pipeline.report.class_map import MAX_DRAWN, ROWS, ClassMap
+from pipeline.report.maps import BAD, DOUBTFUL, FAIR, GOOD, MISSING, NO_FIGURE, Entry
 from pipeline.report.page_template import page_template
 from pipeline.report.pictures import data_uri
 from pipeline.report.statistics import QUANTILES, run_statistics
@@ -112,15 +112,10 @@ class _Seen:
     """The rows of all buildings for the page, part by part."""
 
     def __init__(self, slow: set[str]) -> None:
-        label, colour, _ = _STATUSES[Status.OK]
-        others = [
-            MapClass(name=one.value, label=_STATUSES[one][0], colour=_STATUSES[one][1])
-            for one in _STATUSES
-            if one is not Status.OK
-        ]
-        tiles = MapClass(name=_FAILED_TILE, label="tile that could not be published", colour=BAD, hatched=True)
+        kinds = {one.value: Entry(label, colour) for one, (label, colour, _) in _STATUSES.items()}
+        tiles = Entry("tile that could not be published", BAD, hatched=True)
         self.map = ClassMap(
-            "Buildings by status", MapClass(name=Status.OK.value, label=label, colour=colour), [tiles, *others]
+            "Buildings by status", {Status.OK.value: kinds[Status.OK.value], _FAILED_TILE: tiles} | kinds
         )
         self.slow: dict[str, Mapping[str, Any]] = {}
         """Rows of the slowest buildings by id."""

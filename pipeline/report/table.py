@@ -12,11 +12,8 @@ class CountTable:
     """A table of texts."""
 
     title: str
-    """What is counted."""
     header: tuple[str, ...]
-    """One text per column."""
     rows: tuple[tuple[str, ...], ...]
-    """The first column names the row."""
 
 
 def statistics_tables(statistics: Mapping[str, Any]) -> list[CountTable]:

@@ -17,10 +17,8 @@ import shapely
 
 from pipeline.io.crs import to_degrees
 from service.errors import RequestError
-from service.features.index import Box
+from service.features.index import CRS84, Box
 
-CRS84 = "http://www.opengis.net/def/crs/OGC/1.3/CRS84"
-"""Longitude and latitude in WGS 84: the default."""
 _EPSG = "http://www.opengis.net/def/crs/EPSG/0/"
 _ALWAYS = {CRS84: "OGC:CRS84", f"{_EPSG}4326": "EPSG:4326", f"{_EPSG}3857": "EPSG:3857"}
 _DECIMALS_DEG, _DECIMALS = 9, 3

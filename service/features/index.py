@@ -23,6 +23,8 @@ NAME = "rows.sqlite"
 """File name of a job's index in its folder of outputs; not an output itself."""
 GONE = "the buildings of this job are no longer in the state folder: submit it again"
 """The message if the index was removed."""
+CRS84 = "http://www.opengis.net/def/crs/OGC/1.3/CRS84"
+"""Longitude and latitude in WGS 84: the default of answers."""
 TABLES = ("buildings", "planes", "rejected")
 """Tables of a run that are collections, by the names of the layers of a GeoPackage."""
 TIMES = ("acquired_from", "acquired_to")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import concurrent.futures
+import errno
 import json
 import shutil
 import sqlite3
@@ -19,17 +20,23 @@ import shapely
 from pipeline.errors import RunError
 from pipeline.export.geoparquet import table_files
 from pipeline.runtime.manifest import RunManifest
-from service.features.coordinates import CRS84, RunCrs
-from service.features.index import TABLES, TIMES, stamp
+from service.features.coordinates import RunCrs
+from service.features.index import CRS84, TABLES, TIMES, stamp
 from service.features.pages import from_wkb, geojson
 from service.features.tables import GEOMETRY, LAYERS, TILE, Layer
 
 _READERS = 8
 """Tiles that are read at once: files of an object store take long to arrive."""
-_BOUNDS = ("x_min", "y_min", "x_max", "y_max")
-_DEGREES = ("west", "south", "east", "north")
+_BOUNDS = ("x_min", "y_min", "x_max", "y_max", "west", "south", "east", "north")
+"""Bounds of a building in the CRS of the run and in degrees."""
 _WORDS = ("status", "roof_type", "reason")
 """Properties of buildings that pages of a job's buildings select by."""
+_BY_ID = f"""
+CREATE INDEX IF NOT EXISTS buildings_by_id ON buildings (id, {", ".join((*_WORDS, *_BOUNDS))});
+CREATE INDEX IF NOT EXISTS planes_by_id ON planes (id);
+CREATE INDEX IF NOT EXISTS rejected_by_id ON rejected (id);
+"""
+"""The search indexes. That of buildings holds all that pages of a job's buildings select by, which spares the table."""
 _SQL = {"text": "TEXT", "boolean": "INTEGER", "time": "TEXT", "list": "TEXT"}
 _LAYOUT = """
 CREATE TABLE fact (name TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;  -- values as JSON
@@ -55,17 +62,13 @@ CREATE TABLE city (                   -- of a job that runs: where the CityJSON 
 def _table(layer: Layer) -> str:
     """The rows of a table by position: geometries as WKB, times as ISO 8601 in UTC, lists as JSON.
 
-    Buildings also have their footprint in degrees, as GeoJSON, with its bounds; and their search index holds all that
-    pages of a job's buildings select by, which spares these the table.
+    Buildings also have bounds, and their footprint in degrees as GeoJSON.
     """
-    has_degrees = layer.table == "buildings"
-    bounds = [*_BOUNDS, *(_DEGREES if has_degrees else ())]
-    columns = [f"{name} REAL" for name in bounds] + (["degrees TEXT"] if has_degrees else [])
+    columns = [f"{name} REAL" for name in _BOUNDS] + ["degrees TEXT"] if layer.table == "buildings" else []
     columns += [f'"{name}" {_SQL.get(kind) or _number(layer, name)}' for name, kind in layer.kinds.items()]
-    indexed = ["id", *((*_WORDS, *bounds) if has_degrees else ())]
     return (
         f"CREATE TABLE {layer.table} (position INTEGER PRIMARY KEY, id TEXT NOT NULL, geometry BLOB,"
-        f" {', '.join(columns)}); CREATE INDEX {layer.table}_by_id ON {layer.table} ({', '.join(indexed)});"
+        f" {', '.join(columns)});"
     )
 
 
@@ -112,14 +115,14 @@ class IndexWriter:
         first, number = self.connection.execute(last, (table,)).fetchone()
         shapes = from_wkb([row[GEOMETRY] for row in rows])
         bounds = shapely.bounds(shapes)
-        more: list[list[Any]] = [column.tolist() for column in bounds.T]
+        more: list[list[Any]] = []
         if table == "buildings":
             degrees = (
                 self.crs.written(shapes, self.crs.named(CRS84, "crs"))
                 if self.crs.is_known
                 else np.full(len(shapes), None)
             )
-            more += [column.tolist() for column in shapely.bounds(degrees).T]
+            more += [column.tolist() for column in np.hstack([bounds, shapely.bounds(degrees)]).T]
             more.append([None if shape is None else geojson(shape) for shape in degrees])
         more += [_stored(kind, name, tile, rows) for name, kind in layer.kinds.items()]
         ids = [layer.feature_id(row) for row in rows]
@@ -136,11 +139,19 @@ class IndexWriter:
         """Open for writing."""
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, *raised: object) -> None:
-        """Finish the file, or leave it if there was an exception."""
-        if kind is None:
-            self.connection.execute("COMMIT")
-        self.connection.close()
+    def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
+        """Finish the file, or leave it if there was an exception; raises OSError if it cannot be written."""
+        try:
+            if error is None:
+                self.connection.execute("COMMIT")
+                self.connection.executescript(_BY_ID)  # faster than while rows are added
+        except sqlite3.OperationalError as fault:
+            error = fault
+        finally:
+            self.connection.close()
+        if isinstance(error, sqlite3.OperationalError):
+            number = errno.ENOSPC if error.sqlite_errorname == "SQLITE_FULL" else errno.EIO
+            raise OSError(number, f"the index cannot be written ({error})") from error
 
 
 def _stored(kind: str, name: str, tile: str, rows: Sequence[Mapping[str, Any]]) -> list[Any]:
@@ -174,6 +185,8 @@ class GrowingIndex(IndexWriter):
         if path.exists():
             shutil.copyfile(path, self._own)
         super().__init__(self._own, crs)
+        self.connection.executescript(_BY_ID)
+        self.connection.execute("BEGIN")
 
     def figure(self, sql: str) -> int:
         """One number of the index."""

@@ -17,7 +17,7 @@ from pydantic import AfterValidator
 
 from pipeline.model import Reason, RoofType, Status
 from service.errors import NoSuchBuildingError, RequestError, ResultNotReadyError
-from service.features.index import RowIndex
+from service.features.index import CRS84, RowIndex
 from service.features.pages import Condition, among, bounded_by, collected, feature_texts, sorted_page
 from service.outputs.catalogue import ResultsCrs
 from service.outputs.kinds import CITYJSON, GEOJSON, GLB, OBJ
@@ -44,7 +44,7 @@ from service.wire.queries import Statuses, entry_of, window, words
 router = APIRouter(tags=["results"])
 
 _FORMATS: Mapping[str, str] = {"json": GEOJSON, "obj": OBJ, "glb": GLB, "cityjson": CITYJSON}
-_CRS84 = "http://www.opengis.net/def/crs/OGC/1.3/CRS84"
+_URI = CRS84
 
 
 class CoordinateChoice(StrEnum):
@@ -52,7 +52,7 @@ class CoordinateChoice(StrEnum):
 
     CRS84 = "CRS84"
     """Longitude and latitude in WGS 84."""
-    CRS84_URI = _CRS84
+    CRS84_URI = _URI
     """The same by its full name."""
     NATIVE = "native"
     """Easting and northing of the tiles, in their own units."""
@@ -383,7 +383,7 @@ def _state(finished: FinishedJob) -> dict[str, Any]:
 
 
 def _headers(finished: FinishedJob, *, native: bool) -> dict[str, str]:
-    uri = finished.catalogue.crs.uri if native else _CRS84
+    uri = finished.catalogue.crs.uri if native else _URI
     return {
         # the next answer of a running job is another one
         "Cache-Control": "private, no-cache" if finished.is_complete else "no-store",

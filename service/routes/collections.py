@@ -26,7 +26,7 @@ from service.errors import (
     RequestError,
     ResultNotReadyError,
 )
-from service.features.index import TABLES
+from service.features.index import CRS84, TABLES
 from service.features.pages import Search, ShapeTest, acquired_in, collected, feature_texts
 from service.features.runs import OpenRun, PublishedRun, split_id
 from service.files import StateFolder, is_id
@@ -73,7 +73,6 @@ MAX_LIMIT = 10_000
 """Maximum number of features of one page."""
 MAX_START = 2**53 - 1
 _SCHEMA = "https://json-schema.org/draft/2020-12/schema"
-_CRS84 = "http://www.opengis.net/def/crs/OGC/1.3/CRS84"
 _NOT_SHOWN = (NoSuchCollectionError, NoSuchOutputError, ResultNotReadyError, JobFailedError)
 
 router = APIRouter(tags=["features"])
@@ -96,8 +95,8 @@ _COLLECTION_EXAMPLE: dict[str, Any] = {
     "title": "delft: buildings",
     "description": "footprints of all candidates, with status and figures",
     "itemType": "feature",
-    "extent": {"spatial": {"bbox": [[4.35, 51.99, 4.38, 52.01]], "crs": _CRS84}},
-    "crs": [_CRS84, "http://www.opengis.net/def/crs/EPSG/0/28992"],
+    "extent": {"spatial": {"bbox": [[4.35, 51.99, 4.38, 52.01]], "crs": CRS84}},
+    "crs": [CRS84, "http://www.opengis.net/def/crs/EPSG/0/28992"],
     "storageCrs": "http://www.opengis.net/def/crs/EPSG/0/28992",
     "links": [{"href": "http://127.0.0.1:8000/collections/delft.buildings/items", "rel": "items", "type": GEOJSON}],
 }
@@ -218,7 +217,7 @@ def _described(run: OpenRun, table: str, base: str) -> Collection:
     totals, layer, name = run.index.totals(table), LAYERS[table], run.collection_id(table)
     place = f"{base}/collections/{name}"
     bounds = None if totals.bounds is None else run.crs.outside(totals.bounds, run.crs.named(None, "crs"))
-    spatial = None if bounds is None else SpatialExtent(bbox=[[round(value, 7) for value in bounds]], crs=_CRS84)
+    spatial = None if bounds is None else SpatialExtent(bbox=[[round(value, 7) for value in bounds]], crs=CRS84)
     temporal = TemporalExtent(interval=[list(totals.times)]) if totals.times != (None, None) else None
     links = [
         link(place, "self", "This collection"),
@@ -408,7 +407,7 @@ def _search(run: OpenRun, table: str, asked: _Asked, given: Sequence[tuple[str, 
 def _texts(run: OpenRun, table: str, positions: Sequence[int], crs: str | None) -> tuple[Iterator[bytes], str]:
     """Features as GeoJSON in the CRS of a query parameter, and its URI."""
     named = run.crs.named(crs, "crs")
-    is_stored = table == "buildings" and named.uri == _CRS84
+    is_stored = table == "buildings" and named.uri == CRS84
     written = None if is_stored else lambda shapes: run.crs.written(shapes, named)
     return feature_texts(run.index, table, positions, written), named.uri
 

@@ -25,26 +25,15 @@ from live_service import serving, settings_in
 from pipeline.export.geoparquet import read_table
 from pipeline.export.records import KEYS, SCHEMAS
 from pipeline.runtime.manifest import RunStatus
+from service.disk import has_no_space
 from service.errors import RequestError, StartUpError
 from service.features import cql2, pages
 from service.features.cql2 import MAX_DEPTH, MAX_LENGTH, parsed
 from service.features.runs import check_published, published_runs
+from service.features.writing import IndexWriter
 from service.keys import Scope
 
 TABLES = ("buildings", "planes", "rejected")
-
-
-def nine_tiles() -> runs.Tiles:
-    """Eight buildings in each of nine tiles, some without outline."""
-    makers = (small.gable, small.pent, small.courtyard, small.failed)
-    return {
-        f"x{850 + column}_y{4470 + row}": [
-            runs.placed(makers[k % 4](), f"{column} {row} {k}", column * 100.0 + k * 11.0, row * 100.0 + k * 7.0)
-            for k in range(8)
-        ]
-        for column in range(3)
-        for row in range(3)
-    }
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,7 +63,7 @@ class Served:
 
 @pytest.fixture(scope="module")
 def served(service: runs.Service) -> Served:
-    job_id = service.finished(lambda run_dir: runs.write_run(run_dir, nine_tiles()))
+    job_id = service.finished(lambda run_dir: runs.write_run(run_dir, runs.nine_tiles(8)))
     return Served(service, job_id, service.folder.run(job_id, 1))
 
 
@@ -321,6 +310,19 @@ def test_elevations_in_feet_are_stated_and_third_coordinates_are_in_the_unit_of_
             assert sorted({*z}) == pytest.approx(sorted({*np.round(own * 0.3048, 3)}), abs=1e-3)
 
 
+def test_a_full_disk_is_said_as_one(tmp_path: Path) -> None:
+    def fill() -> None:
+        with IndexWriter(tmp_path / "index", None) as writer:
+            writer.connection.execute("COMMIT")
+            writer.connection.execute("PRAGMA max_page_count = 1")
+            writer.connection.execute("BEGIN")
+            writer.connection.execute("INSERT INTO batch VALUES (zeroblob(100000))")
+
+    with pytest.raises(OSError, match="database or disk is full") as error:
+        fill()
+    assert has_no_space(error.value)
+
+
 def test_a_run_that_is_replaced_is_read_again(starting: Callable[..., Any], tmp_path: Path) -> None:
     run_dir = runs.write_run(tmp_path / "town")
     local = starting(publish=(str(run_dir),))
@@ -329,29 +331,29 @@ def test_a_run_that_is_replaced_is_read_again(starting: Callable[..., Any], tmp_
     manifest = json.loads((run_dir / "run.json").read_text())
     (run_dir / "run.json").write_text(json.dumps(manifest | {"status": "running"}))
     assert "running, not finished" in runs.problem(local.client.get(items), 404, "result-not-ready")
-    runs.write_run(tmp_path / "new", nine_tiles()).rename(tmp_path / "newer")
+    runs.write_run(tmp_path / "new", runs.nine_tiles(8)).rename(tmp_path / "newer")
     run_dir.rename(tmp_path / "old")
     (tmp_path / "newer").rename(run_dir)
     assert local.client.get(items).json()["numberMatched"] == 72
     assert len(list((tmp_path / "state" / "features").iterdir())) == 1
 
 
-def test_a_job_whose_crs_is_local_has_no_collections(service: runs.Service) -> None:
-    job_id = service.finished(lambda run_dir: runs.with_local_crs(runs.write_run(run_dir)))
+@pytest.mark.parametrize(
+    ("write", "found"),
+    [
+        (lambda run_dir: runs.with_local_crs(runs.write_run(run_dir)), "local (site)"),
+        (lambda run_dir: runs.write_run(run_dir, epsg=None), "unknown"),
+    ],
+)
+def test_a_job_without_a_place_on_the_globe_has_no_collections(
+    service: runs.Service, write: Callable[[Path], object], found: str
+) -> None:
+    job_id = service.finished(write)
     answer = service.client.get(f"/collections/{job_id}.buildings/items")
-    assert "is local (site), so its features have no place" in runs.problem(answer, 404, "no-such-collection")
+    assert f"is {found}, so its features have no place" in runs.problem(answer, 404, "no-such-collection")
     listed = service.client.get("/collections?limit=100").json()["collections"]
     assert not [one for one in listed if one["id"].startswith(job_id)]
-    whole = service.client.get(f"/jobs/{job_id}/buildings").json()
-    assert len(whole["features"]) == 6
-
-
-def test_a_job_whose_crs_is_unknown_has_no_collections(service: runs.Service) -> None:
-    job_id = service.finished(lambda run_dir: runs.write_run(run_dir, epsg=None))
-    answer = service.client.get(f"/collections/{job_id}.buildings/items")
-    assert "is unknown, so its features have no place on the globe" in runs.problem(answer, 404, "no-such-collection")
-    listed = service.client.get("/collections?limit=100").json()["collections"]
-    assert not [one for one in listed if one["id"].startswith(job_id)]
+    assert len(service.client.get(f"/jobs/{job_id}/buildings").json()["features"]) == 6
 
 
 # --- hostile filters -------------------------------------------------------------------------------------------------
@@ -429,7 +431,7 @@ def test_a_comparison_with_null_is_neither_true_nor_false() -> None:
 @pytest.mark.slow
 def test_gdal_reads_a_served_run_with_ids_and_types_of_the_tables(tmp_path: Path) -> None:
     assert "OAPIF" in pyogrio.list_drivers()
-    run_dir = runs.write_run(tmp_path / "town", nine_tiles())
+    run_dir = runs.write_run(tmp_path / "town", runs.nine_tiles(8))
     kinds = {"string": "string", "double": "double", "bool": "bool", "int32": "int32", "int64": "int32"}
     with serving(settings_in(tmp_path, publish=(str(run_dir),))) as url:
         assert [name for name, _ in pyogrio.list_layers(f"OAPIF:{url}")] == [f"town.{table}" for table in TABLES]

@@ -17,7 +17,6 @@ import geoparquet_validator
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-import pyproj
 import pytest
 import shapely
 import small_buildings as small
@@ -186,6 +185,7 @@ def test_a_merged_table_holds_every_row_of_every_tile_and_no_other(run_dir: Path
     order = [(key, "ascending")] + ([("plane_id", "ascending")] if name == "planes" else [])
     assert merged.sort_by(order).select(tiles.schema.names).cast(tiles.schema).equals(tiles.sort_by(order))
     assert merged.schema.names == tiles.schema.names
+    assert merged.schema.field("tile") == pa.field("tile", pa.string(), nullable=False)
 
 
 def test_row_groups_have_one_size_wherever_the_tiles_end(
@@ -281,15 +281,6 @@ def test_cjio_reads_the_merged_city_objects(out_dir: Path) -> None:
     assert "7415" in checked.stdout
 
 
-def test_city_objects_tell_what_a_viewer_colours_by(out_dir: Path) -> None:
-    lines = parsed_lines(output_file(out_dir, "cityjson"))
-    for line in lines[1:]:
-        attributes = line["CityObjects"][line["id"]]["attributes"]
-        assert {"status", "roof_type", "n_points"} <= set(attributes)
-        if attributes["status"] != "failed":
-            assert {"ground_z", "eave_z", "ridge_z", "height_m", "rmse_m", "volume_m3"} <= set(attributes)
-
-
 # --- GeoJSON ---------------------------------------------------------------------------------------------------------
 
 
@@ -315,40 +306,29 @@ def test_the_footprints_are_rfc_7946_with_all_columns_and_all_buildings(out_dir:
     assert statuses == {"ok": 4, "fallback": 1, "failed": 1}
 
 
-def test_footprints_come_back_to_the_millimetre(out_dir: Path) -> None:
-    degrees = geopandas.read_file(output_file(out_dir, "geojson")).set_index("building_id").to_crs(28992)
-    own = geopandas.read_parquet(output_file(out_dir, "buildings")).set_index("building_id")
+@pytest.mark.parametrize("epsg", [7415, 2225])  # metres; feet, also of elevations
+def test_footprints_come_back_to_the_millimetre(tmp_path: Path, epsg: int) -> None:
+    write_outputs(runs.write_run(tmp_path / "run", epsg=epsg), tmp_path / "out", ("geojson", "buildings"))
+    own = geopandas.read_parquet(tmp_path / "out/buildings.parquet").set_index("building_id")
+    degrees = geopandas.read_file(tmp_path / "out/buildings.geojson").set_index("building_id").to_crs(own.crs.to_2d())
     for name in own.index[own.geometry.notna()]:
         assert shapely.hausdorff_distance(degrees.geometry[name], own.geometry[name]) < 1e-3
 
 
-def test_a_known_point_lies_where_the_survey_says(tmp_path: Path) -> None:
-    # the tower at Amersfoort, origin of the Dutch grid: 155000, 463000 is 52.15517 N, 5.38721 E in WGS 84
-    tower = runs.placed(small.pent(), "tower", 155_000.0 - small.ORIGIN[0], 463_000.0 - small.ORIGIN[1])
-    write_outputs(runs.write_run(tmp_path / "run", {"x1550_y4630": [tower]}), tmp_path / "out")
+@pytest.mark.parametrize(
+    ("epsg", "easting", "northing", "degrees"),
+    [
+        (7415, 155_000.0, 463_000.0, (5.38721, 52.15517)),  # the tower at Amersfoort, origin of the Dutch grid
+        (3035, 4_321_000.0, 3_210_000.0, (10.0, 52.0)),  # the centre of a projection that names northing first
+    ],
+)
+def test_a_known_point_lies_where_the_survey_says(
+    tmp_path: Path, epsg: int, easting: float, northing: float, degrees: tuple[float, float]
+) -> None:
+    there = runs.placed(small.pent(), "there", easting - small.ORIGIN[0], northing - small.ORIGIN[1])
+    write_outputs(runs.write_run(tmp_path / "run", {"x1_y1": [there]}, epsg=epsg), tmp_path / "out")
     (feature,) = json.loads(output_file(tmp_path / "out", "geojson").read_text())["features"]
-    west, south, _, _ = shapely.geometry.shape(feature["geometry"]).bounds
-    assert (west, south) == (pytest.approx(5.38721, abs=2e-5), pytest.approx(52.15517, abs=2e-5))
-    crs = read_catalogue(tmp_path / "out").crs
-    assert crs.uri == "http://www.opengis.net/def/crs/EPSG/0/28992"
-
-
-def test_a_crs_that_names_northing_first_is_read_easting_first(tmp_path: Path) -> None:
-    # the centre of the European equal-area projection is 52 N, 10 E at easting 4321000, northing 3210000
-    centre = runs.placed(small.pent(), "centre", 4_321_000.0 - small.ORIGIN[0], 3_210_000.0 - small.ORIGIN[1])
-    write_outputs(runs.write_run(tmp_path / "run", {"x1_y1": [centre]}, epsg=3035), tmp_path / "out")
-    (feature,) = json.loads(output_file(tmp_path / "out", "geojson").read_text())["features"]
-    assert shapely.geometry.shape(feature["geometry"]).bounds[:2] == pytest.approx((10.0, 52.0), abs=1e-5)
-
-
-def test_elevations_in_feet_do_not_move_footprints(tmp_path: Path) -> None:
-    write_outputs(runs.write_run(tmp_path / "run", epsg=2225), tmp_path / "out")
-    own = geopandas.read_parquet(tmp_path / "out/buildings.parquet").dropna(subset="geometry")
-    back = pyproj.Transformer.from_crs("OGC:CRS84", 2225, always_xy=True)
-    features = json.loads((tmp_path / "out/buildings.geojson").read_text())["features"]
-    shapes = {f["id"]: shapely.geometry.shape(f["geometry"]) for f in features if f["geometry"] is not None}
-    for name, geometry in zip(own.building_id, own.geometry, strict=True):
-        assert back.transform(*shapes[name].centroid.coords[0]) == pytest.approx(geometry.centroid.coords[0], abs=0.01)
+    assert shapely.geometry.shape(feature["geometry"]).bounds[:2] == pytest.approx(degrees, abs=2e-5)
 
 
 def test_footprints_and_report_state_the_unit_of_elevations(tmp_path: Path) -> None:
@@ -371,24 +351,16 @@ def test_a_footprint_without_a_place_on_earth_is_a_feature_without_geometry(tmp_
     assert json.loads(output_file(tmp_path / "out", "report").read_text())["buildings"]["without_footprint"] == 1
 
 
-def test_an_unknown_crs_is_reported_and_the_coordinates_stay_the_tiles_own(tmp_path: Path) -> None:
-    write_outputs(runs.write_run(tmp_path / "run", epsg=None), tmp_path / "out")
-    found = json.loads(output_file(tmp_path / "out", "geojson").read_text())
-    assert found["coordRefSys"] is None
-    assert "not WGS 84" in found["note"]
-    (gable,) = [feature for feature in found["features"] if feature["id"] == runs.ident("gable")]
-    assert shapely.geometry.shape(gable["geometry"]).bounds == (85_000.0, 447_000.0, 85_010.0, 447_008.0)
-    assert not read_catalogue(tmp_path / "out").crs.is_known
-
-
-def test_a_crs_without_a_place_on_earth_is_named_and_the_coordinates_stay_the_tiles_own(tmp_path: Path) -> None:
-    write_outputs(runs.with_local_crs(runs.write_run(tmp_path / "run")), tmp_path / "out")
+@pytest.mark.parametrize("name", [None, "site"])
+def test_without_a_place_on_earth_the_coordinates_stay_the_tiles_own(tmp_path: Path, name: str | None) -> None:
+    run_dir = runs.write_run(tmp_path / "run", epsg=None if name is None else 7415)
+    write_outputs(run_dir if name is None else runs.with_local_crs(run_dir), tmp_path / "out")
     found = json.loads(output_file(tmp_path / "out", "geojson").read_text())
     assert (found["coordRefSys"], "not WGS 84" in found["note"]) == (None, True)
     (gable,) = [feature for feature in found["features"] if feature["id"] == runs.ident("gable")]
     assert shapely.geometry.shape(gable["geometry"]).bounds == (85_000.0, 447_000.0, 85_010.0, 447_008.0)
     crs = read_catalogue(tmp_path / "out").crs
-    assert (crs.name, crs.is_known) == ("site", False)
+    assert (crs.name, crs.is_known) == (name, False)
 
 
 # --- meshes ----------------------------------------------------------------------------------------------------------
@@ -502,9 +474,3 @@ def test_three_times_the_tiles_need_hardly_more_memory(tmp_path: Path) -> None:
         peaks.append(int(peak_kb) * 1024)
     assert read_catalogue(tmp_path / "out 180").n_buildings == 180 * 60
     assert peaks[1] - peaks[0] < 30 * 2**20
-
-
-def test_the_schema_of_a_merged_table_is_that_of_the_run_with_the_tile_as_data(out_dir: Path) -> None:
-    schema = pq.read_schema(output_file(out_dir, "buildings"))
-    assert schema.field("tile") == pa.field("tile", pa.string(), nullable=False)
-    assert schema.names[-2:] == ["bbox", "tile"]

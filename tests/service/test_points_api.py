@@ -13,9 +13,6 @@ import pytest
 from points_glb import read_points_glb
 from starlette.testclient import TestClient
 
-from pipeline.extras.octree.point_glb import NO_BUILDING
-from service.keys import Scope, new_key
-
 GABLE = runs.ident("gable")
 
 
@@ -59,28 +56,6 @@ def test_a_tileset_leads_to_all_points(client: TestClient, job_id: str, start: s
     assert points.buildings == (GABLE,)
 
 
-def test_files_of_points_are_kept_by_the_client_for_good(client: TestClient, job_id: str) -> None:
-    for name in ("tileset.json", "x850_y4470/tileset.json", "x850_y4470/r.glb"):
-        answer = client.get(f"/jobs/{job_id}/points/{name}")
-        assert answer.headers["cache-control"] == "private, max-age=31536000, immutable"
-        again = client.get(f"/jobs/{job_id}/points/{name}", headers={"If-None-Match": answer.headers["etag"]})
-        assert (again.status_code, again.content) == (304, b"")
-        head = client.head(f"/jobs/{job_id}/points/{name}")
-        assert (head.status_code, head.headers["etag"]) == (200, answer.headers["etag"])
-
-
-def test_nodes_are_sent_in_ranges_and_compressed(client: TestClient, job_id: str) -> None:
-    address = f"/jobs/{job_id}/points/x850_y4470/r.glb"
-    whole = client.get(address)
-    part = client.get(address, headers={"Range": "bytes=4-11"})
-    assert (part.status_code, part.content) == (206, whole.content[4:12])
-    beyond = client.get(address, headers={"Range": "bytes=999999-"})
-    assert "lies beyond the end" in runs.problem(beyond, 416, "about:blank")
-    packed = client.get(address, headers={"Accept-Encoding": "gzip"})
-    assert packed.headers["content-encoding"] == "gzip"
-    assert packed.content == whole.content
-
-
 def test_the_points_of_a_building_are_one_file(client: TestClient, job_id: str) -> None:
     answer = client.get(f"/jobs/{job_id}/buildings/{GABLE}/points")
     assert answer.status_code == 200
@@ -109,31 +84,6 @@ def test_a_job_without_points_has_no_tileset(client: TestClient, bare: str) -> N
     assert "tileset" not in client.get(f"/jobs/{bare}/results").json()
 
 
-@pytest.mark.parametrize(
-    "name",
-    ["x850_y4470/buildings.json", "x850_y4470/..%2f..%2frun.json", "..%2frun.json", "x850_y4470/r9.glb", "a/b.glb",
-     "x850_y4470/r0.glb", "tileset-ecef.json", "x850_y4470%2ftileset.json%0a"],
-)  # fmt: skip
-def test_only_files_of_tilesets_are_served(client: TestClient, job_id: str, name: str) -> None:
-    answer = client.get(f"/jobs/{job_id}/points/{name}")
-    assert (answer.status_code, answer.headers["content-type"]) == (404, "application/problem+json")
-
-
-def test_points_of_another_key_are_not_seen(tmp_path: Any) -> None:
-    with runs.service(tmp_path / "state") as service:
-        keys = [new_key(name, Scope.SUBMIT, now=service.store.now()) for name in ("mine", "theirs")]
-        for key, _ in keys:
-            service.store.add_key(key)
-        job = service.finished(owner=keys[0][0].key_id)
-        for path in ("points/tileset.json", "points/x850_y4470/r.glb", f"buildings/{GABLE}/points"):
-            answers = [
-                service.client.get(f"/jobs/{job}/{path}", headers={"Authorization": f"Bearer {secret}"}).status_code
-                for _, secret in keys
-            ]
-            assert answers == [200, 404]
-            assert service.client.get(f"/jobs/{job}/{path}").status_code == 401
-
-
 def test_a_file_that_is_gone_is_a_clear_answer(service: runs.Service) -> None:
     job = service.finished()
     shutil.rmtree(service.folder.run(job, 1) / "points" / "x850_y4470")
@@ -143,8 +93,3 @@ def test_a_file_that_is_gone_is_a_clear_answer(service: runs.Service) -> None:
     assert "submit the job again" in runs.problem(
         service.client.get(f"/jobs/{job}/buildings/{GABLE}/points"), 404, "no-such-building"
     )
-
-
-def test_the_points_of_the_example_hold_one_that_belongs_to_no_building(client: TestClient, job_id: str) -> None:
-    points, _ = read_points_glb(client.get(f"/jobs/{job_id}/points/x850_y4470/r.glb").content)
-    assert (points.building == NO_BUILDING).sum() == 1

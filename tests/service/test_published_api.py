@@ -21,7 +21,6 @@ from pipeline.export.glb_container import read_document
 from pipeline.extras.party_walls.party_walls_of_run import party_walls
 from pipeline.extras.publish.publishing import Form
 from pipeline.runtime.manifest import RunStatus
-from service.keys import Scope, new_key
 from service.outputs import published
 from service.outputs.kinds import FORMATS, ON_REQUEST, OUTPUTS
 
@@ -40,15 +39,18 @@ def bare(service: runs.Service) -> str:
     return service.finished()
 
 
-def test_further_formats_are_outputs_with_sizes_and_sums(client: TestClient, job_id: str, bare: str) -> None:
+def test_the_document_lists_every_output_by_reference_with_its_size_and_sum(
+    client: TestClient, job_id: str, bare: str
+) -> None:
     found = client.get(f"/jobs/{job_id}/results").json()
     assert list(found) == [name for name in OUTPUTS if name != "solar"]
-    for name in ON_REQUEST - {"solar"}:
-        answer = client.get(found[name]["href"])
-        assert answer.headers["content-type"] == found[name]["type"] == OUTPUTS[name].media_type
-        assert len(answer.content) == found[name]["bytes"]
-        assert hashlib.sha256(answer.content).hexdigest() == found[name]["sha256"]
-    assert set(client.get(f"/jobs/{bare}/results").json()).isdisjoint(ON_REQUEST)
+    for name, entry in found.items():
+        assert entry["href"] == f"http://127.0.0.1/jobs/{job_id}/results/{name}"
+        answer = client.get(entry["href"])
+        assert answer.headers["content-type"] == entry["type"] == OUTPUTS[name].media_type
+        assert len(answer.content) == entry["bytes"] == int(answer.headers["content-length"])
+        assert hashlib.sha256(answer.content).hexdigest() == entry["sha256"]
+    assert list(client.get(f"/jobs/{bare}/results").json()) == [name for name in OUTPUTS if name not in ON_REQUEST]
 
 
 @pytest.mark.parametrize("start", ["results/3dtiles", "results/3dtiles/tileset.json"])
@@ -67,16 +69,19 @@ def test_a_globe_finds_all_models_from_either_tileset(client: TestClient, job_id
     assert buildings == {("x850_y4470.glb", 2), ("x851_y4470.glb", 1), ("x850_y4471.glb", 2)}
 
 
-def test_files_of_a_tileset_are_kept_for_good_and_sent_in_ranges_and_compressed(
-    client: TestClient, job_id: str
+@pytest.mark.parametrize("name", ["results/3dtiles/models/x850_y4470.glb", "points/x850_y4470/r.glb"])
+def test_files_that_never_change_are_kept_for_good_and_sent_in_ranges_and_compressed(
+    client: TestClient, job_id: str, name: str
 ) -> None:
-    address = f"/jobs/{job_id}/results/3dtiles/models/x850_y4470.glb"
+    address = f"/jobs/{job_id}/{name}"
     whole = client.get(address)
     assert whole.headers["cache-control"] == "private, max-age=31536000, immutable"
     again = client.get(address, headers={"If-None-Match": whole.headers["etag"]})
     assert (again.status_code, again.content) == (304, b"")
     part = client.get(address, headers={"Range": "bytes=0-3"})
     assert (part.status_code, part.content) == (206, b"glTF")
+    beyond = client.get(address, headers={"Range": "bytes=999999-"})
+    assert "lies beyond the end" in runs.problem(beyond, 416, "about:blank")
     packed = client.get(address, headers={"Accept-Encoding": "gzip"})
     assert (packed.headers["content-encoding"], packed.content) == ("gzip", whole.content)
 
@@ -145,7 +150,10 @@ def test_the_catalogue_leads_to_the_points_and_names_no_folder(client: TestClien
      "results/3dtiles/..%2frows.sqlite", "results/stac/x850_y4470/x851_y4470.json", "results/report/tileset.json",
      "results/nothing/tileset.json", "results/3dtiles/tileset.json%0a", "run/state/x850_y4470/x850_y4470.json",
      "run/buildings/tile=x850_y4470/..%2f..%2frun.json", "run/buildings/tile=x1_y1/part-0.parquet",
-     "results/3dtiles/skylines/x1_y1.glb"],
+     "results/3dtiles/skylines/x1_y1.glb", "results/outputs.json", "results/rows.sqlite", "results/%00",
+     "results/..%2f..%2fservice.db", "points/x850_y4470/buildings.json", "points/x850_y4470/..%2f..%2frun.json",
+     "points/..%2frun.json", "points/x850_y4470/r9.glb", "points/a/b.glb", "points/x850_y4470/r0.glb",
+     "points/tileset-ecef.json", "points/x850_y4470%2ftileset.json%0a"],
 )  # fmt: skip
 def test_nothing_else_is_served(client: TestClient, job_id: str, path: str) -> None:
     answer = client.get(f"/jobs/{job_id}/{path}")
@@ -158,7 +166,8 @@ def test_nothing_else_is_served(client: TestClient, job_id: str, path: str) -> N
      "/jobs/JOB/results/3dtiles/tileset.json", "/jobs/JOB/results/3dtiles/models/x850_y4470.glb",
      "/jobs/JOB/results/stac/collection.json", "/jobs/JOB/results/stac/x850_y4470/x850_y4470.json",
      "/jobs/JOB/run/buildings/tile=x850_y4470/part-0.parquet", "/jobs/JOB/results/3dtiles/nothing.json",
-     "/jobs/JOB/run/state/x1_y1/x1_y1.json", "/collections", "/collections/JOB.buildings",
+     "/jobs/JOB/run/state/x1_y1/x1_y1.json", "/jobs/JOB/points/tileset.json",
+     "/collections", "/collections/JOB.buildings",
      "/collections/JOB.buildings/queryables", "/collections/JOB.buildings/schema", "/collections/JOB.buildings/items",
      "/collections/JOB.buildings/items?limit=2&filter=height_m%20%3E%201", "/collections/JOB.buildings/items/nothing",
      "/collections/JOB.nothing/items"],
@@ -179,22 +188,6 @@ def test_a_job_without_further_formats_says_so(client: TestClient, bare: str) ->
         assert "the request left out" in runs.problem(client.get(f"/jobs/{bare}/{path}"), 404, "no-such-output")
     of_run = client.get(f"/jobs/{bare}/run/buildings/tile=x850_y4470/part-0.parquet")
     assert "publish stac" in runs.problem(of_run, 404, "no-such-output")
-
-
-def test_formats_of_another_key_are_not_seen(tmp_path: Path) -> None:
-    with runs.service(tmp_path / "state") as service:
-        keys = [new_key(name, Scope.SUBMIT, now=service.store.now()) for name in ("mine", "theirs")]
-        for key, _ in keys:
-            service.store.add_key(key)
-        job = service.finished(owner=keys[0][0].key_id, publish=("3dtiles", "stac"))
-        for path in ("results/3dtiles/tileset.json", "results/stac/x850_y4470/x850_y4470.json",
-                     "run/buildings/tile=x850_y4470/part-0.parquet"):  # fmt: skip
-            answers = [
-                service.client.get(f"/jobs/{job}/{path}", headers={"Authorization": f"Bearer {secret}"}).status_code
-                for _, secret in keys
-            ]
-            assert answers == [200, 404]
-            assert service.client.get(f"/jobs/{job}/{path}").status_code == 401
 
 
 def test_what_cannot_be_made_leaves_the_rest(service: runs.Service, client: TestClient) -> None:

@@ -226,13 +226,6 @@ def test_few_requests_wait_for_a_selection(service: runs.Service, tmp_path: Path
         assert {one.result() for one in waiting} == {place}
 
 
-def test_what_is_not_made_for_a_status_is_refused_before_a_selection_is_made(service: runs.Service) -> None:
-    job_id = service.finished(write_run)
-    answer = service.client.get(f"/jobs/{job_id}/results/points", params={"status": "ok"})
-    runs.problem(answer, 404, "no-such-output")
-    assert not (service.folder.outputs(job_id, 1) / "selected").exists()
-
-
 def test_the_client_and_its_command_fetch_a_selection(site: Site) -> None:
     job_id = site.runs.finished(write_run)
     out, client = site.folder / "out", site.client()

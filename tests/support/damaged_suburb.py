@@ -10,45 +10,13 @@ from roofs_by_hand import lifted, models_of_scene, moved, points_of
 
 from pipeline.model import RoofType, Status
 from pipeline.ruler.evaluation.evaluate import Evaluation
-from pipeline.ruler.evaluation.measure import Better, Definition, Group, Measure
+from pipeline.ruler.evaluation.measure import Measure
 from pipeline.ruler.evaluation.models import ModelSet, RoofModel, RoofSurface
 from pipeline.ruler.evaluation.reference import Reference, ReferencePoints
 from pipeline.ruler.simulation.solids import building_solid
 from pipeline.ruler.simulation.suburb import suburb
 
 WITHIN_M = 0.2
-DEFINITIONS = {
-    name: Definition(name=name, group=Group(name.split(".")[0]), label=label, unit=unit, better=better, formula=formula)
-    for name, label, unit, better, formula in (
-        (
-            "delivery.lod2",
-            "buildings with an LoD2 model",
-            "share",
-            Better.HIGHER,
-            "buildings with a model / all buildings",
-        ),
-        (
-            "delivery.false_models",
-            "models where no building is",
-            "count",
-            Better.LOWER,
-            "models that stand on no reference building",
-        ),
-        (
-            "residuals.within_0_2m",
-            "points within 0.2 m",
-            "share",
-            Better.HIGHER,
-            "`n_within / n_points` where |dz| < 0.2 m & a roof is there",
-        ),
-        ("residuals.rmse", "RMSE", "m", Better.LOWER, "root of the mean of squares"),
-        ("residuals.bias", "mean distance", "m", Better.ZERO, "mean of dz"),
-        ("faces.completeness_10m2", "true faces >= 10 m2 found", "share", Better.HIGHER, "TP / (TP + FN)"),
-        ("roof_types.correct", "outcome correct", "share", Better.HIGHER, "correct / all"),
-        ("footprints.iou_median", "footprint IoU, median", "", Better.HIGHER, "median of IoU"),
-    )
-}
-"""Stand for those of the measure modules, so that a test says what it expects."""
 KINDS: tuple[dict[str, bool], ...] = (
     {},
     {"points": False},

@@ -27,6 +27,7 @@ from pipeline.runtime.manifest import InputFile, PointFileFacts, RunManifest, Ru
 from service.app import create_app
 from service.files import StateFolder
 from service.jobs import InputReference, Job, JobFailure, JobRequest
+from service.keys import Scope, new_key
 from service.outputs import write_comparison_outputs, write_outputs
 from service.outputs.published import publish
 from service.settings import ServiceSettings
@@ -68,6 +69,19 @@ def four_tiles() -> Tiles:
         "x851_y4470": [placed(small.two_parts(), "two_parts", 130.0, 20.0, 7.0)],
         "x850_y4471": [placed(small.pent(), "pent", 10.0, 150.0, -3.0), placed(small.gable(), "far", 80.0, 190.0)],
         "x851_y4471": [],
+    }
+
+
+def nine_tiles(n: int) -> Tiles:
+    """So many buildings in each of nine tiles, some without outline."""
+    makers = (small.gable, small.pent, small.courtyard, small.failed)
+    return {
+        f"x{850 + column}_y{4470 + row}": [
+            placed(makers[k % 4](), f"{column} {row} {k}", column * 100.0 + k * 8.0, row * 100.0 + k * 7.0)
+            for k in range(n)
+        ]
+        for column in range(3)
+        for row in range(3)
     }
 
 
@@ -278,6 +292,13 @@ class Service:
         write_outputs(run_dir, out_dir, job.request.outputs)
         self.store.succeed(job, message="done", summary={})
         return job.job_id
+
+    def keys(self, *names: str) -> list[tuple[str, dict[str, str]]]:
+        """New keys that may submit: id and header of each."""
+        made = [new_key(name, Scope.SUBMIT, now=self.store.now()) for name in names]
+        for key, _ in made:
+            self.store.add_key(key)
+        return [(key.key_id, {"Authorization": f"Bearer {secret}"}) for key, secret in made]
 
     def compared(self, **request: Any) -> str:
         """The id of a comparison that is over."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ import shapely
 from pipeline.export.coordinates import decimals
 from pipeline.model import BoolArray, FloatArray, IntArray
 from pipeline.ruler.epochs.epoch import Buildings, Epoch
-from pipeline.ruler.epochs.judging import Circumstances, Limits, Verdicts, judge, limits
+from pipeline.ruler.epochs.judging import judge, limits
 from pipeline.ruler.epochs.matching import Groups, all_pairs, around, grouped, meeting, middles, parts_of
 from pipeline.ruler.epochs.records import SCHEMA, Change
 from pipeline.ruler.epochs.roof_raster import (
@@ -43,6 +43,9 @@ ALIKE_TIMES = 2.0
 """Its area and height must also be at most this many times, and at least 1 / this, of those of the building."""
 _DIGITS = 3
 """Decimals of the table: millimetres."""
+
+_OF_EPOCHS = ("ids", "source_ids", "area_m2", "height_m", "volume_m3", "roof_type")
+"""Columns of both epochs."""
 
 OnPart = Callable[[int, int], None]
 
@@ -84,9 +87,9 @@ def compare_epochs(old: Epoch, new: Epoch, settings: DiffSettings, on_part: OnPa
         limit = limits(before, after, settings)
         figures = _figures(old, new, sides, before, after, boxes[part], limit, settings)
         seen = _circumstances(old, new, before, after, coverages, groups, part)
-        verdicts = judge(before, after, figures, limit, seen, settings)
+        verdicts = judge(before, after, figures, limit["least_height_change_m"], seen, settings)
         done += len(part)
-        yield _table(old, before, after, figures, limit, verdicts, groups.common_m2[part])
+        yield _table(old, before, after, figures, limit | verdicts, groups.common_m2[part])
         on_part(done, groups.count)
 
 
@@ -150,11 +153,11 @@ def _figures(
     before: Side,
     after: Side,
     boxes: FloatArray,
-    limit: Limits,
+    limit: Mapping[str, FloatArray],
     settings: DiffSettings,
 ) -> FloatArray:
     """The figures of `compare_roofs`; groups that exist in one epoch alone are compared as empty."""
-    both = (before.count > 0) & (after.count > 0)
+    both = (before["count"] > 0) & (after["count"] > 0)
     found = [epoch.roofs(one.buildings) for epoch, one in zip((old, new), sides, strict=True)]
     columns: list[list[npt.NDArray[Any]]] = [[], [], [], []]
     first = 0
@@ -174,7 +177,7 @@ def _figures(
     kept = both[group]
     order = np.argsort(group[kept], kind="stable")
     group, face, is_new, is_own = (values[kept][order] for values in (group, face, is_new, is_own))
-    ground = np.nan_to_num(np.column_stack([before.ground_m, after.ground_m]))
+    ground = np.nan_to_num(np.column_stack([before["ground_m"], after["ground_m"]]))
     return compare_roofs(
         _joined(found[0][0], found[1][0]),
         RoofGroups(
@@ -183,8 +186,8 @@ def _figures(
             is_new=is_new,
             is_own=is_own,
             boxes=np.where(both[:, None], boxes, 0.0),
-            width_m=limit.width_m,
-            height_m=limit.height_m,
+            width_m=limit["least_width_m"],
+            height_m=limit["least_height_change_m"],
             ground_m=ground,
         ),
         settings.uniform_share,
@@ -205,20 +208,22 @@ def _joined(old: RoofFaces, new: RoofFaces) -> RoofFaces:
 
 def _circumstances(
     old: Epoch, new: Epoch, before: Side, after: Side, coverages: tuple[Any, ...], groups: Groups, part: IntArray
-) -> Circumstances:
+) -> dict[str, Any]:
     """What each epoch knows about the buildings that only the other one has."""
     count = len(part)
     known: dict[str, Any] = {}
     for name, epoch, coverage, side, missing in (
-        ("old", old, coverages[0], after, before.count == 0),
-        ("new", new, coverages[1], before, after.count == 0),
+        ("old", old, coverages[0], after, before["count"] == 0),
+        ("new", new, coverages[1], before, after["count"] == 0),
     ):
-        alone = np.flatnonzero(missing & ~shapely.is_missing(side.footprints))
+        alone = np.flatnonzero(missing & ~shapely.is_missing(side["footprints"]))
         covered, failed, rejected = np.ones(count), np.zeros(count, np.bool_), np.zeros(count, np.bool_)
-        covered[alone] = coverage.share(side.footprints[alone])
-        failed[alone] = coverage.touches_failed(side.footprints[alone])
-        rejected[alone] = _rejected_alike(epoch, side.footprints[alone], side.area_m2[alone], side.height_m[alone])
-        known |= {f"covered_by_{name}": covered, f"failed_tile_of_{name}": failed, f"rejected_in_{name}": rejected}
+        covered[alone] = coverage.share(side["footprints"][alone])
+        failed[alone] = coverage.touches_failed(side["footprints"][alone])
+        rejected[alone] = _rejected_alike(
+            epoch, side["footprints"][alone], side["area_m2"][alone], side["height_m"][alone]
+        )
+        known |= {f"covered_{name}": covered, f"tile_failed_{name}": failed, f"rejected_{name}": rejected}
     pairs = groups.pairs
     overlap = np.zeros(count)
     first, second = groups.of_old[pairs.old], groups.of_new[pairs.new]
@@ -226,9 +231,9 @@ def _circumstances(
         place = np.minimum(np.searchsorted(part, group), count - 1)
         kept = (first != second) & (part[place] == group)
         overlap += np.bincount(place[kept], weights=pairs.common_m2[kept], minlength=count)
-    area_m2 = np.nan_to_num(before.area_m2) + np.nan_to_num(after.area_m2)
+    area_m2 = np.nan_to_num(before["area_m2"]) + np.nan_to_num(after["area_m2"])
     overlapped = np.divide(overlap, area_m2, out=np.zeros(count), where=area_m2 > 0.0)
-    return Circumstances(overlapped=overlapped, **known)
+    return known | {"overlapped": overlapped}
 
 
 def _rejected_alike(epoch: Epoch, footprints: Any, area_m2: FloatArray, height_m: FloatArray) -> BoolArray:
@@ -255,74 +260,53 @@ def _rejected_alike(epoch: Epoch, footprints: Any, area_m2: FloatArray, height_m
 
 
 def _table(
-    epoch: Epoch,
-    before: Side,
-    after: Side,
-    figures: FloatArray,
-    limit: Limits,
-    verdicts: Verdicts,
-    common_m2: FloatArray,
+    epoch: Epoch, before: Side, after: Side, figures: FloatArray, verdicts: Mapping[str, Any], common_m2: FloatArray
 ) -> pa.Table:
-    """The rows of a part of the groups, `change_id` ascending."""
-    both = (before.count > 0) & (after.count > 0)
-    compared = both & ~(before.has_failed | after.has_failed)
-    is_new, is_gone = verdicts.change == Change.NEW.value, verdicts.change == Change.GONE.value
-    union = np.nan_to_num(before.area_m2) + np.nan_to_num(after.area_m2) - common_m2
-    iou = np.where(both & (union > 0.0), common_m2 / np.where(union > 0.0, union, 1.0), np.nan)
-
-    def of_parts(column: int, alone: BoolArray, whole: FloatArray) -> FloatArray:
-        """A figure of the raster if both epochs have a model; the whole building if it is new or gone."""
-        values = np.where(compared, figures[:, column], np.where(is_new | is_gone, 0.0, np.nan))
-        return np.where(alone, whole, values)
-
-    def where(mask: BoolArray, values: FloatArray) -> FloatArray:
-        return np.where(mask, values, np.nan)
-
-    no_building = np.zeros_like(both)
-    columns: dict[str, Any] = {
-        "change": verdicts.change,
-        "is_raised": verdicts.is_raised,
-        "is_lowered": verdicts.is_lowered,
-        "is_reshaped": verdicts.is_reshaped,
-        "reason": verdicts.reason,
-        "doubts": _doubts(verdicts),
-        "relation": verdicts.relation,
-        "old_ids": before.ids,
-        "new_ids": after.ids,
-        "old_source_ids": before.source_ids,
-        "new_source_ids": after.source_ids,
-        "iou": _rounded(iou, 4),
-        "old_area_m2": before.area_m2,
-        "new_area_m2": after.area_m2,
-        "area_change_m2": _difference(before.area_m2, after.area_m2, is_new, is_gone),
-        "old_height_m": before.height_m,
-        "new_height_m": after.height_m,
-        "height_change_m": where(compared, figures[:, MEDIAN_M]),
-        "ridge_change_m": where(compared, after.ridge_m - before.ridge_m),
-        "ground_change_m": where(compared, after.ground_m - before.ground_m),
-        "old_volume_m3": before.volume_m3,
-        "new_volume_m3": after.volume_m3,
-        "volume_change_m3": _difference(before.volume_m3, after.volume_m3, is_new, is_gone),
-        "added_m2": of_parts(ADDED_M2, is_new, after.area_m2),
-        "removed_m2": of_parts(REMOVED_M2, is_gone, before.area_m2),
-        "raised_m2": of_parts(RAISED_M2, no_building, figures[:, RAISED_M2]),
-        "lowered_m2": of_parts(LOWERED_M2, no_building, figures[:, LOWERED_M2]),
-        "gained_m3": of_parts(GAINED_M3, is_new, after.volume_m3),
-        "lost_m3": of_parts(LOST_M3, is_gone, before.volume_m3),
-        "max_raise_m": where(compared & (figures[:, MAX_RAISE_M] > 0.0), figures[:, MAX_RAISE_M]),
-        "max_drop_m": where(compared & (figures[:, MAX_DROP_M] > 0.0), figures[:, MAX_DROP_M]),
-        "roof_difference_m": where(compared, figures[:, DIFFERENCE_M]),
-        "least_height_change_m": where(compared, limit.height_m),
-        "least_width_m": where(compared, limit.width_m),
-        "change_ratio": verdicts.change_ratio,
-        "old_roof_type": before.roof_type,
-        "new_roof_type": after.roof_type,
-        "old_acquired": before.acquired_to,
-        "new_acquired": after.acquired_from,
-        "geometry": _wkb(before, after, epoch.reference.horizontal_unit_m),
-        "change_id": _change_ids(before, after),
+    """The rows of a part of the groups, `change_id` ascending; `verdicts` are columns as they are."""
+    both = (before["count"] > 0) & (after["count"] > 0)
+    compared = both & ~(before["has_failed"] | after["has_failed"])
+    is_new, is_gone = verdicts["change"] == Change.NEW.value, verdicts["change"] == Change.GONE.value
+    union = np.nan_to_num(before["area_m2"]) + np.nan_to_num(after["area_m2"]) - common_m2
+    columns = {
+        f"{prefix}_{name}": side[name] for prefix, side in (("old", before), ("new", after)) for name in _OF_EPOCHS
     }
-    return _sorted_table(columns)
+    # A figure of the raster if both epochs have a model; the whole building if it is new or gone.
+    for name, column, alone, whole in (
+        ("added_m2", ADDED_M2, is_new, after["area_m2"]),
+        ("removed_m2", REMOVED_M2, is_gone, before["area_m2"]),
+        ("raised_m2", RAISED_M2, False, 0.0),
+        ("lowered_m2", LOWERED_M2, False, 0.0),
+        ("gained_m3", GAINED_M3, is_new, after["volume_m3"]),
+        ("lost_m3", LOST_M3, is_gone, before["volume_m3"]),
+    ):
+        values = np.where(compared, figures[:, column], np.where(is_new | is_gone, 0.0, np.nan))
+        columns[name] = np.where(alone, whole, values)
+    for name, mask, values in (
+        ("height_change_m", compared, figures[:, MEDIAN_M]),
+        ("ridge_change_m", compared, after["ridge_m"] - before["ridge_m"]),
+        ("ground_change_m", compared, after["ground_m"] - before["ground_m"]),
+        ("max_raise_m", compared & (figures[:, MAX_RAISE_M] > 0.0), figures[:, MAX_RAISE_M]),
+        ("max_drop_m", compared & (figures[:, MAX_DROP_M] > 0.0), figures[:, MAX_DROP_M]),
+        ("roof_difference_m", compared, figures[:, DIFFERENCE_M]),
+        ("least_height_change_m", compared, verdicts["least_height_change_m"]),
+        ("least_width_m", compared, verdicts["least_width_m"]),
+    ):
+        columns[name] = np.where(mask, values, np.nan)
+    for unit in ("area_change_m2", "volume_change_m3"):  # a new or gone building counts as 0 in the other epoch
+        name = unit.replace("_change", "")
+        columns[unit] = np.where(is_gone, 0.0, after[name]) - np.where(is_new, 0.0, before[name])
+    iou = np.where(both & (union > 0.0), common_m2 / np.where(union > 0.0, union, 1.0), np.nan)
+    return _sorted_table(
+        {
+            **verdicts,
+            **columns,
+            "iou": _rounded(iou, 4),
+            "old_acquired": before["acquired_to"],
+            "new_acquired": after["acquired_from"],
+            "geometry": _wkb(before, after, epoch.reference.horizontal_unit_m),
+            "change_id": _change_ids(before, after),
+        }
+    )
 
 
 def _sorted_table(columns: dict[str, Any]) -> pa.Table:
@@ -335,40 +319,24 @@ def _sorted_table(columns: dict[str, Any]) -> pa.Table:
     return pa.table(arrays, schema=SCHEMA).sort_by("change_id")
 
 
-def _difference(before: FloatArray, after: FloatArray, is_new: BoolArray, is_gone: BoolArray) -> FloatArray:
-    """Later less earlier; a new or gone building counts as 0 in the other epoch."""
-    difference: FloatArray = np.where(is_gone, 0.0, after) - np.where(is_new, 0.0, before)
-    return difference
-
-
 def _rounded(values: FloatArray, digits: int) -> pa.Array:
     """Figures as the table holds them: null if unknown, no negative zero."""
     return pa.array(np.round(values, digits) + 0.0, mask=~np.isfinite(values))
 
 
-def _doubts(verdicts: Verdicts) -> pa.ListArray:
-    """The doubts of each group as lists, in the order of their closed list."""
-    masks = np.column_stack([mask for _, mask in verdicts.doubts])
-    words = np.array([doubt.value for doubt, _ in verdicts.doubts], object)
-    starts = np.concatenate([[0], np.cumsum(masks.sum(axis=1))])
-    return pa.ListArray.from_arrays(
-        pa.array(starts, pa.int32()), pa.array(words[np.nonzero(masks)[1]], type=pa.string())
-    )
-
-
 def _change_ids(before: Side, after: Side) -> npt.NDArray[np.object_]:
     """The name of each group: from its first building in the later epoch, else in the earlier one."""
-    found = np.full(len(before.count), None, object)
-    for prefix, side, of in (("o-", before, before.count > 0), ("n-", after, after.count > 0)):
-        starts = side.ids.offsets.to_numpy()[:-1][of]
-        names = side.ids.values.take(pa.array(starts)).to_pylist()
+    found = np.full(len(before["count"]), None, object)
+    for prefix, side, of in (("o-", before, before["count"] > 0), ("n-", after, after["count"] > 0)):
+        starts = side["ids"].offsets.to_numpy()[:-1][of]
+        names = side["ids"].values.take(pa.array(starts)).to_pylist()
         found[of] = [prefix + name for name in names]
     return found
 
 
 def _wkb(before: Side, after: Side, unit_m: float) -> Any:
     """The geometries of the rows in units of the CRS, in one canonical form."""
-    geometry = np.where(after.count > 0, after.footprints, before.footprints)
+    geometry = np.where(after["count"] > 0, after["footprints"], before["footprints"])
     if unit_m != 1.0:
         geometry = shapely.transform(geometry, lambda xy: np.round(xy / unit_m, decimals(unit_m)))
     canonical = shapely.orient_polygons(shapely.normalize(geometry))

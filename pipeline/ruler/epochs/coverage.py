@@ -14,6 +14,7 @@ from pipeline.extras.footprints.footprints_file import read_area
 from pipeline.io.crs import SpatialReference
 from pipeline.io.storage import sha256_of
 from pipeline.model import FloatArray
+from pipeline.ruler.evaluation.matching import share_in_extent
 from pipeline.runtime.manifest import RunManifest
 
 
@@ -35,21 +36,12 @@ class Coverage:
 
     def share(self, footprints: Any) -> FloatArray:
         """Share of each footprint, (n,), that is covered and not in a failed tile; 1 if the coverage is unknown."""
-        share = np.ones(len(footprints)) if self.area is None else _share(footprints, self.area)
-        return share if self.failed.is_empty else np.maximum(share - _share(footprints, self.failed), 0.0)
+        share = np.ones(len(footprints)) if self.area is None else share_in_extent(footprints, self.area)
+        return share if self.failed.is_empty else np.maximum(share - share_in_extent(footprints, self.failed), 0.0)
 
     def touches_failed(self, footprints: Any) -> Any:
         """Which footprints, (n,) bool, reach into a tile that failed."""
         return shapely.intersects(self.failed, footprints)
-
-
-def _share(footprints: Any, area: Any) -> FloatArray:
-    """Share of each footprint inside an area."""
-    shapely.prepare(area)
-    share = np.where(shapely.covers(area, footprints), 1.0, 0.0)
-    border = np.flatnonzero((share == 0.0) & shapely.intersects(area, footprints) & (shapely.area(footprints) > 0.0))
-    share[border] = shapely.area(shapely.intersection(footprints[border], area)) / shapely.area(footprints[border])
-    return share
 
 
 def coverage_of(manifest: RunManifest, reference: SpatialReference) -> Coverage:

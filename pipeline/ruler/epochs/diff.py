@@ -48,17 +48,12 @@ class Diff:
     """The result of a comparison."""
 
     request: DiffRequest
-    """The request."""
     old: Epoch
-    """The earlier epoch."""
     new: Epoch
-    """The later one."""
     summary: Summary
-    """All sums."""
     warnings: tuple[str, ...]
     """Warnings about the result, one sentence each."""
     written: tuple[Path, ...]
-    """The files."""
 
     def as_dict(self) -> dict[str, Any]:
         """The content of `changes.json`, without times and durations: the same runs give the same bytes."""

@@ -23,6 +23,7 @@ from pipeline.io.crs import SpatialReference
 from pipeline.model import FloatArray, IntArray
 from pipeline.ruler.epochs.coverage import Coverage, coverage_of
 from pipeline.ruler.epochs.roof_raster import RoofFaces
+from pipeline.ruler.evaluation.matching import sound_polygons
 from pipeline.runtime.manifest import RunManifest, RunStatus
 from pipeline.runtime.manifest_reading import read_manifest
 
@@ -70,13 +71,9 @@ class Epoch:
     name: str
     """OLD or NEW, for messages."""
     run_dir: str
-    """Path or URL."""
     manifest: RunManifest
-    """Its manifest."""
     reference: SpatialReference
-    """CRS and units."""
     coverage: Coverage
-    """Where it has data."""
     boxes: FloatArray
     """(n, 4) float64, bounds of all footprints in metres: west, south, east, north; nan without geometry."""
     files: IntArray
@@ -92,7 +89,6 @@ class Epoch:
     schemas: tuple[pa.Schema, pa.Schema]
     """Schemas of the tables of buildings and of planes."""
     table: pads.Dataset
-    """The table of buildings."""
 
     def __len__(self) -> int:
         """Number of buildings."""
@@ -206,9 +202,8 @@ def _footprints(column: Any, unit_m: float) -> Any:
     found = shapely.from_wkb(np.array(column.to_pylist(), dtype=object))
     if unit_m != 1.0:
         found = shapely.transform(found, lambda xy: xy * unit_m)
-    bad = ~shapely.is_missing(found) & ~shapely.is_valid(found)
-    if bad.any():
-        found[bad] = shapely.make_valid(found[bad], method="structure", keep_collapsed=False)
+    known = ~shapely.is_missing(found)
+    found[known] = sound_polygons(found[known])
     return found
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 import shapely
@@ -19,24 +19,18 @@ from scipy.sparse.csgraph import connected_components
 from pipeline.model import BoolArray, FloatArray, IntArray
 from pipeline.ruler.epochs.epoch import Epoch
 from pipeline.ruler.epochs.settings import DiffSettings
-from pipeline.ruler.evaluation.matching import summed
+from pipeline.ruler.evaluation.matching import overlapping, summed
 
 ROWS_PER_PART = 20_000
 """Buildings of one epoch whose geometry is in memory at once, about."""
-_MIN_M2 = 1e-6
-"""Numerical guard: smaller overlaps are none."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Pairs:
-    """Pairs of footprints that share area, all of length p."""
+class Pairs(NamedTuple):
+    """Pairs of footprints that share area: rows of the earlier epoch, ascending, rows of the later one, that area."""
 
     old: IntArray
-    """(p,) int64, row of the earlier epoch; ascending."""
     new: IntArray
-    """(p,) int64, row of the later one."""
     common_m2: FloatArray
-    """(p,) float64, area that they share."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -102,18 +96,6 @@ def around(boxes: FloatArray) -> FloatArray:
     return np.concatenate([boxes[:, :2].min(axis=0), boxes[:, 2:].max(axis=0)])
 
 
-def overlapping(old: Any, new: Any) -> tuple[IntArray, IntArray, FloatArray]:
-    """Indices into two arrays of valid footprints that share area, and that area in m2; ordered by both indices."""
-    if len(old) == 0 or len(new) == 0:
-        return np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0)
-    a, b = shapely.STRtree(new).query(old)
-    order = np.lexsort((b, a))
-    a, b = a[order].astype(np.int64), b[order].astype(np.int64)
-    common = shapely.area(shapely.intersection(old[a], new[b]))
-    some = common > _MIN_M2
-    return a[some], b[some], common[some]
-
-
 def all_pairs(old: Epoch, new: Epoch) -> tuple[Pairs, FloatArray, FloatArray]:
     """All pairs of buildings that share area, and the areas of all footprints, 0 without geometry.
 
@@ -127,9 +109,9 @@ def all_pairs(old: Epoch, new: Epoch) -> tuple[Pairs, FloatArray, FloatArray]:
         near = np.flatnonzero(meeting(new.boxes, around(old.boxes[part])))
         first, second = old.buildings(part, ("geometry",)), new.buildings(near, ("geometry",))
         old_m2[first.rows] = shapely.area(first.footprints)
-        a, b, common = overlapping(first.footprints, second.footprints)
+        shared = overlapping(first.footprints, second.footprints)
         new_m2[second.rows] = shapely.area(second.footprints)
-        found.append((first.rows[a], second.rows[b], common))
+        found.append((first.rows[shared.first], second.rows[shared.second], shared.common_m2))
     unseen = np.flatnonzero((new_m2 == 0.0) & np.isfinite(new.boxes).all(axis=1))
     for part in parts_of(middles(new.boxes[unseen])):
         alone = new.buildings(unseen[part], ("geometry",))

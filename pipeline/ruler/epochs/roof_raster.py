@@ -75,9 +75,7 @@ class _Grid(NamedTuple):
     west: float
     """Easting of its lower left corner."""
     south: float
-    """Northing of that corner."""
     cell: float
-    """Side of a cell."""
 
 
 class _Limits(NamedTuple):

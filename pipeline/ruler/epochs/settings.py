@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
@@ -83,10 +82,6 @@ class DiffSettings(Parameters):
         minimum=-1000.0,
         maximum=1000.0,
     )
-
-    def swapped(self) -> DiffSettings:
-        """The same with OLD and NEW exchanged."""
-        return dataclasses.replace(self, vertical_shift_m=-self.vertical_shift_m)
 
 
 def read_settings(path: str | None, options: Mapping[str, Any]) -> DiffSettings:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -14,49 +14,13 @@ import shapely
 from pipeline.model import BoolArray, FloatArray, IntArray, Status
 from pipeline.ruler.epochs.epoch import Buildings, floats
 
+Side = Mapping[str, Any]
+"""Columns on the buildings of an epoch in g groups; nan and null if it has none.
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Side:
-    """The buildings of an epoch in g groups; nan and null if it has none."""
-
-    count: IntArray
-    """(g,) int64, buildings."""
-    area_m2: FloatArray
-    """(g,) float64, sum of the footprints' areas."""
-    volume_m3: FloatArray
-    """(g,) float64, sum of the volumes."""
-    height_m: FloatArray
-    """(g,) float64, largest height above ground."""
-    ground_m: FloatArray
-    """(g,) float64, lowest elevation of a floor, metres."""
-    ridge_m: FloatArray
-    """(g,) float64, highest roof point, metres."""
-    sigma_m: FloatArray
-    """(g,) float64, standard deviation of the roofs' elevations, of the worst model; 0 if unknown."""
-    spacing_m: FloatArray
-    """(g,) float64, largest point spacing; 0 if unknown."""
-    unexplained_m2: FloatArray
-    """(g,) float64, plan area of roof without points; 0 if unknown."""
-    has_failed: BoolArray
-    """(g,) bool, some building has no model."""
-    has_block: BoolArray
-    """(g,) bool, some model is a block in place of a roof."""
-    has_doubtful: BoolArray
-    """(g,) bool, some model is not supported by its own points."""
-    at_edge: BoolArray
-    """(g,) bool, some building touches the edge of the data."""
-    roof_type: npt.NDArray[np.object_]
-    """(g,) str, of the largest building; None without one."""
-    ids: pa.ListArray
-    """(g,) names of the buildings, sorted."""
-    source_ids: pa.ListArray
-    """(g,) ids of the given footprints, in the order of `ids`; null without one."""
-    acquired_from: pa.Array
-    """(g,) earliest acquisition."""
-    acquired_to: pa.Array
-    """(g,) latest acquisition."""
-    footprints: Any
-    """(g,) shapely geometries in metres, several united; None without one."""
+Sums and extremes have the names of `buildings.parquet`. `sigma_m` is the standard deviation of the roofs' elevations,
+of the worst model, 0 if unknown, as is `spacing_m`. `footprints` are shapely geometries in metres, several united, None
+without one. `has_failed`, `has_block`, `has_doubtful` and `at_edge` hold if they do for some building.
+"""
 
 
 def side_of(buildings: Buildings, group: IntArray, count: int, vertical_unit_m: float) -> Side:
@@ -92,27 +56,27 @@ def side_of(buildings: Buildings, group: IntArray, count: int, vertical_unit_m: 
 
     spread = np.fmax(floats(table["noise_m"]), floats(table["ridge_z_sigma_m"]))
     sigma_m = np.nan_to_num(np.where(is_block | np.isnan(spread), floats(table["rmse_m"]), spread))
-    return Side(
-        count=numbers.astype(np.int64),
-        area_m2=np.where(numbers > 0, np.bincount(group, weights=area_m2, minlength=count), np.nan),
-        volume_m3=total(floats(table["volume_m3"])),
-        height_m=extreme(floats(table["height_m"]), np.maximum, -np.inf),
-        ground_m=extreme(floats(table["ground_z"]) * vertical_unit_m, np.minimum, np.inf),
-        ridge_m=extreme(floats(table["ridge_z"]) * vertical_unit_m, np.maximum, -np.inf),
-        sigma_m=extreme(sigma_m, np.maximum, 0.0),
-        spacing_m=extreme(floats(table["point_spacing_m"]), np.maximum, 0.0),
-        unexplained_m2=np.nan_to_num(total(floats(table["unexplained_m2"]))),
-        has_failed=some(status == Status.FAILED.value),
-        has_block=some(is_block),
-        has_doubtful=some(status == Status.DOUBTFUL.value),
-        at_edge=some(table["touches_data_edge"].to_numpy(zero_copy_only=False).astype(np.bool_)),
-        roof_type=_of_largest(table["roof_type"].to_numpy(zero_copy_only=False), area_m2, group, count),
-        ids=_lists(table["building_id"], starts),
-        source_ids=_lists(table["source_id"], starts),
-        acquired_from=_times(table["acquired_from"], group, count, np.minimum),
-        acquired_to=_times(table["acquired_to"], group, count, np.maximum),
-        footprints=_united(footprints, starts, numbers),
-    )
+    return {
+        "count": numbers.astype(np.int64),
+        "area_m2": np.where(numbers > 0, np.bincount(group, weights=area_m2, minlength=count), np.nan),
+        "volume_m3": total(floats(table["volume_m3"])),
+        "height_m": extreme(floats(table["height_m"]), np.maximum, -np.inf),
+        "ground_m": extreme(floats(table["ground_z"]) * vertical_unit_m, np.minimum, np.inf),
+        "ridge_m": extreme(floats(table["ridge_z"]) * vertical_unit_m, np.maximum, -np.inf),
+        "sigma_m": extreme(sigma_m, np.maximum, 0.0),
+        "spacing_m": extreme(floats(table["point_spacing_m"]), np.maximum, 0.0),
+        "unexplained_m2": np.nan_to_num(total(floats(table["unexplained_m2"]))),
+        "has_failed": some(status == Status.FAILED.value),
+        "has_block": some(is_block),
+        "has_doubtful": some(status == Status.DOUBTFUL.value),
+        "at_edge": some(table["touches_data_edge"].to_numpy(zero_copy_only=False).astype(np.bool_)),
+        "roof_type": _of_largest(table["roof_type"].to_numpy(zero_copy_only=False), area_m2, group, count),
+        "ids": _lists(table["building_id"], starts),
+        "source_ids": _lists(table["source_id"], starts),
+        "acquired_from": _times(table["acquired_from"], group, count, np.minimum),
+        "acquired_to": _times(table["acquired_to"], group, count, np.maximum),
+        "footprints": _united(footprints, starts, numbers),
+    }
 
 
 def _lists(column: pa.ChunkedArray, starts: IntArray) -> pa.ListArray:

@@ -43,7 +43,6 @@ class Level:
     spread_m: float | None
     """Half of the distance between the quantiles that hold 68.27 % of them: one standard deviation."""
     count: int
-    """Roofs."""
 
 
 class Summary:

@@ -36,7 +36,6 @@ class Share:
     """A figure from 0 to 1. If all units agree on 0 or 1, resampling has no spread and an exact limit is given."""
 
     figure: Statistic
-    """The figure itself."""
     denominator: str
     """Column whose units that are not zero count as trials."""
 
@@ -60,7 +59,6 @@ class Estimate:
     low: float
     """Lower end; nan with fewer than two units."""
     high: float
-    """Upper end."""
 
 
 def bootstrap(columns: Mapping[str, FloatArray], statistic: Statistic, *, draws: int = DRAWS) -> Estimate:

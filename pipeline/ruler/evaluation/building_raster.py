@@ -11,9 +11,8 @@ import math
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-import scipy.sparse
-import scipy.sparse.csgraph
 import shapely
+from scipy.ndimage import binary_closing, binary_dilation, binary_erosion, binary_opening
 from shapely import MultiPolygon, Polygon
 
 from pipeline.compiler import kernel
@@ -38,9 +37,7 @@ class CellWindow:
     column: int
     """First column; columns grow east."""
     rows: int = WINDOW_CELLS
-    """Number of rows."""
     columns: int = WINDOW_CELLS
-    """Number of columns."""
 
     def grown(self, cells: int) -> CellWindow:
         """With a margin on all sides."""
@@ -78,34 +75,10 @@ def windows_of(bounds: FloatArray) -> list[CellWindow]:
     return sorted(found)
 
 
-# ------------------------------------------------------------------------------------------------------- morphology
-
-
-def dilated(cells: BoolArray) -> BoolArray:
-    """Grown by the 3 x 3 cross; cells outside are not set."""
-    grown = cells.copy()
-    grown[1:] |= cells[:-1]
-    grown[:-1] |= cells[1:]
-    grown[:, 1:] |= cells[:, :-1]
-    grown[:, :-1] |= cells[:, 1:]
-    return grown
-
-
-def eroded(cells: BoolArray) -> BoolArray:
-    """Shrunk by the 3 x 3 cross; cells outside count as set."""
-    return ~dilated(~cells)
-
-
 def edge_ring(cells: BoolArray) -> BoolArray:
-    """The cells on either side of the borders of the set cells: dilation without erosion."""
-    return dilated(cells) & ~eroded(cells)
-
-
-def _cleaned(cells: BoolArray) -> BoolArray:
-    """Closed twice, opened once; right for cells `_REACH_CELLS` from the border."""
-    for step in (*[dilated] * _CLOSINGS, *[eroded] * _CLOSINGS, eroded, dilated):
-        cells = step(cells)
-    return cells
+    """The cells on either side of the borders of the set cells: dilation without erosion by the 3 x 3 cross."""
+    ring: BoolArray = binary_dilation(cells) & ~binary_erosion(cells, border_value=1)
+    return ring
 
 
 # ---------------------------------------------------------------------------------------------------------- polygons
@@ -177,26 +150,6 @@ class PlanRaster:
 # ------------------------------------------------------------------------------------------------------------ points
 
 
-@kernel
-def _window_keys(x: FloatArray, y: FloatArray, cell: float, side: int) -> IntArray:
-    """Window of each point (n,) in metres, row and column in one number."""
-    keys = np.empty(len(x), np.int64)
-    for i in range(len(x)):
-        keys[i] = (math.floor(y[i] / cell) // side << 32) + math.floor(x[i] / cell) // side
-    return keys
-
-
-@kernel
-def _vote(
-    balance: LabelArray, slot: IntArray, x: FloatArray, y: FloatArray, counted: BoolArray, cell: float, side: int
-) -> None:
-    """Add 1 to the cell of each counted point, subtract 1 for each other one: balance (windows, side, side)."""
-    for i in range(len(x)):
-        row = math.floor(y[i] / cell) % side
-        column = math.floor(x[i] / cell) % side
-        balance[slot[i], row, column] += 1 if counted[i] else -1
-
-
 class PointRaster:
     """Building cells by the classes of points, added tile by tile.
 
@@ -210,13 +163,15 @@ class PointRaster:
 
     def add(self, xyz: FloatArray, is_building: BoolArray) -> None:
         """Count the points of a tile, (n, 3) metres and (n,) bool."""
-        x, y = np.ascontiguousarray(xyz[:, 0]), np.ascontiguousarray(xyz[:, 1])
-        keys, slot = np.unique(_window_keys(x, y, CELL_M, WINDOW_CELLS), return_inverse=True)
-        balance = np.zeros((len(keys), WINDOW_CELLS, WINDOW_CELLS), np.int32)
-        _vote(balance, slot.astype(np.int64), x, y, is_building, CELL_M, WINDOW_CELLS)
-        for place, votes in zip(keys.tolist(), balance, strict=True):
-            row, column = (place + (1 << 31)) >> 32, ((place + (1 << 31)) & 0xFFFFFFFF) - (1 << 31)
-            self._open[row, column] = self._open.get((row, column), 0) + votes
+        side = WINDOW_CELLS
+        column, row = np.floor(xyz[:, :2] / CELL_M).astype(np.int64).T
+        places, window = np.unique(((row // side) << 32) + column // side, return_inverse=True)
+        cell = (window.ravel() * side + row % side) * side + column % side
+        votes = np.where(is_building, 1.0, -1.0)
+        balance = np.bincount(cell, votes, len(places) * side * side).astype(np.int32).reshape(-1, side, side)
+        for place, of_window in zip(places.tolist(), balance, strict=True):
+            at = (place + (1 << 31)) >> 32, ((place + (1 << 31)) & 0xFFFFFFFF) - (1 << 31)
+            self._open[at] = self._open.get(at, 0) + of_window
 
     def finish(self, still_to_come: Sequence[Sequence[float]] = ()) -> None:
         """Close the windows that no tile to come reaches, given x_min, y_min, x_max, y_max of each of them."""
@@ -244,7 +199,8 @@ class PointRaster:
             cells[r0 - inner.row : r1 - inner.row, c0 - inner.column : c1 - inner.column] = block[
                 r0 - place.row : r1 - place.row, c0 - place.column : c1 - place.column
             ]
-        return _cleaned(cells)[_REACH_CELLS:-_REACH_CELLS, _REACH_CELLS:-_REACH_CELLS]
+        cleaned: BoolArray = binary_opening(binary_closing(cells, iterations=_CLOSINGS))
+        return cleaned[_REACH_CELLS:-_REACH_CELLS, _REACH_CELLS:-_REACH_CELLS]
 
     def outlines(self) -> list[Polygon]:
         """The exact outlines of 4-connected cells, with holes, from the south west."""
@@ -274,42 +230,12 @@ def outlines_of(runs: IntArray) -> list[Polygon]:
     """
     if len(runs) == 0:
         return []
-    runs = runs[np.lexsort((runs[:, 1], runs[:, 0]))]
-    begins = np.ones(len(runs), np.bool_)
-    begins[1:] = (runs[1:, 0] != runs[:-1, 0]) | (runs[1:, 1] != runs[:-1, 2])
-    ends = np.append(np.flatnonzero(begins)[1:], len(runs)) - 1
-    runs = np.column_stack((runs[begins, 0], runs[begins, 1], runs[ends, 2]))
-    pairs = _neighbours(runs)
-    links = scipy.sparse.coo_array((np.ones(len(pairs), np.bool_), (pairs[:, 0], pairs[:, 1])), (len(runs), len(runs)))
-    n, component = scipy.sparse.csgraph.connected_components(links, directed=False)
+    # All coordinates are multiples of 0.5, so the union is exact; areas that share a corner alone stay apart.
     boxes = shapely.box(*(CELL_M * np.column_stack((runs[:, 1], runs[:, 0], runs[:, 2], runs[:, 0] + 1))).T)
-    order = np.argsort(component, kind="stable")
-    starts = np.searchsorted(component[order], np.arange(n + 1))
-    firsts = order[starts[:-1]]
-    outlines = []
-    for k in np.argsort(firsts).tolist():
-        # All coordinates are multiples of 0.5: the union is exact. Normalised rings begin at a corner.
-        outline = shapely.normalize(shapely.union_all(boxes[order[starts[k] : starts[k + 1]]]))
-        outlines.append(shapely.simplify(outline, 0.0))
-    return outlines
+    outlines = shapely.get_parts(shapely.simplify(shapely.normalize(shapely.union_all(boxes)), 0.0)).tolist()
 
+    def first_run(outline: Polygon) -> tuple[float, float]:
+        x, y = shapely.get_coordinates(outline.exterior).T
+        return float(y.min()), float(x[y == y.min()].min())
 
-@kernel
-def _neighbours(runs: IntArray) -> IntArray:
-    """Pairs (p, 2) of sorted runs (n, 3) in consecutive rows that share a column."""
-    n = len(runs)
-    # Sorted, separate runs of two rows overlap fewer times than there are runs.
-    pairs = np.empty((2 * n, 2), np.int64)
-    found = 0
-    below = 0
-    for i in range(n):
-        row = runs[i, 0] - 1
-        while below < i and (runs[below, 0] < row or (runs[below, 0] == row and runs[below, 2] <= runs[i, 1])):
-            below += 1
-        j = below
-        while j < i and runs[j, 0] == row and runs[j, 1] < runs[i, 2]:
-            pairs[found, 0] = j
-            pairs[found, 1] = i
-            found += 1
-            j += 1
-    return pairs[:found]
+    return sorted(outlines, key=first_run)

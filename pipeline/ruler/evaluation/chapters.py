@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
 
 from pipeline.report.table import CountTable
 from pipeline.ruler.evaluation.counts import count_tables
@@ -49,9 +48,7 @@ class Line:
     """One measure of one subset, ready to print."""
 
     definition: Definition
-    """What it is."""
     measure: Measure
-    """The figures."""
     value: str
     """`93.4 %`, `0.052 m`; a dash for a missing figure."""
     interval: str
@@ -75,9 +72,7 @@ class Chapter:
     """The measures of one group."""
 
     group: Group
-    """Which."""
     title: str
-    """Its title."""
     lines: tuple[Line, ...]
     """In the order of the measures; the subsets of one measure follow one another."""
     tables: tuple[CountTable, ...]
@@ -99,14 +94,14 @@ class Chapter:
         return found
 
 
-def definition_of(name: str, definitions: Mapping[str, Definition] = DEFINITIONS) -> Definition:
+def definition_of(name: str) -> Definition:
     """The definition of a measure."""
-    if name not in definitions:
+    if name not in DEFINITIONS:
         raise KeyError(f"measure {name!r} has no definition: add it to DEFINITIONS of the module that measures it")
-    return definitions[name]
+    return DEFINITIONS[name]
 
 
-def chapters(evaluation: Evaluation, definitions: Mapping[str, Definition] = DEFINITIONS) -> tuple[Chapter, ...]:
+def chapters(evaluation: Evaluation) -> tuple[Chapter, ...]:
     """The measures of an evaluation by chapter, in the order of `Group`.
 
     Chapters without measures are left out, and subsets without anything in them.
@@ -116,7 +111,7 @@ def chapters(evaluation: Evaluation, definitions: Mapping[str, Definition] = DEF
     for measure in evaluation.measures:
         if measure.subset not in filled:
             continue
-        group = definition_of(measure.name, definitions).group
+        group = definition_of(measure.name).group
         by_group[group].setdefault(measure.name, []).append(measure)
     tables = count_tables(evaluation.tables)
     return tuple(
@@ -124,7 +119,7 @@ def chapters(evaluation: Evaluation, definitions: Mapping[str, Definition] = DEF
             group=group,
             title=TITLES[group],
             lines=tuple(
-                printed(measure, definitions[name]) for name, measures in named.items() for measure in measures
+                printed(measure, DEFINITIONS[name]) for name, measures in named.items() for measure in measures
             ),
             tables=tables.get(group, ()),
         )

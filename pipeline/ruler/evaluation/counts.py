@@ -135,7 +135,7 @@ def breakdowns(tables: Tables) -> tuple[CountTable, ...]:
     if table is None or table.num_rows == 0:
         return ()
     if "touches_data_edge" in table.column_names:
-        table = table.filter(pa.array(~_bools(table, "touches_data_edge")))
+        table = table.filter(pa.array(~flags(table, "touches_data_edge")))
     ratios = _ratios(table)
     if not ratios or not table.num_rows:
         return ()
@@ -209,6 +209,11 @@ def floats(table: pa.Table, name: str) -> FloatArray:
     return np.array(table[name].cast(pa.float64()).to_numpy(zero_copy_only=False), np.float64)
 
 
+def flags(table: pa.Table, name: str) -> BoolArray:
+    """A column as bool, False where null."""
+    return np.array([bool(value) for value in table[name].to_pylist()], bool)
+
+
 def visible_share(table: pa.Table) -> FloatArray | None:
     """Share of each building's top-visible points within 0.2 m, nan without any; of all points in older tables.
 
@@ -221,11 +226,6 @@ def visible_share(table: pa.Table) -> FloatArray | None:
             np.divide(n_within, n_points, out=shares, where=n_points > 0.0)
             return shares
     return None
-
-
-def _bools(table: pa.Table, name: str) -> BoolArray:
-    """A column as bool, False where null."""
-    return np.array([bool(value) for value in table[name].to_pylist()], bool)
 
 
 def _count(value: Any) -> str:

@@ -30,7 +30,6 @@ class Evaluation:
     """The result of an evaluation."""
 
     models: ModelSet
-    """The measured models."""
     reference: Reference | None
     """The reference, with blocks joined if needed; None: the models alone."""
     measures: tuple[Measure, ...]

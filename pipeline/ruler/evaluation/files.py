@@ -31,7 +31,6 @@ class EvaluationRequest:
     truth: str | None = None
     """The folder of simulated truth."""
     points: tuple[str, ...] = ()
-    """Classified point files."""
     footprints: str | None = None
     """Outlines of buildings, with points."""
     footprints_layer: str | None = None

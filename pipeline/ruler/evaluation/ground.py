@@ -15,7 +15,6 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.compiler import kernel
 from pipeline.errors import InconsistentInputError
 from pipeline.io import ReadOptions, open_source
 from pipeline.io.places import file_at
@@ -151,30 +150,18 @@ def matched_points(
     s = np.zeros(len(b), np.int64) if offered_return is None else offered_return.astype(np.int64)
     if len(a) == len(b) and (a == b).all() and (r == s).all():
         return np.arange(len(a))
-    if len(a) == 0 or len(b) == 0:
-        return np.full(len(a), -1, np.int64)
-    corner = np.minimum(a.min(axis=0), b.min(axis=0))
-    keys = []
-    for mm, number in ((a - corner, r), (b - corner, s)):
-        plan, rest = mm[:, 0] << 32 | mm[:, 1], mm[:, 2] << 8 | number
-        order = np.lexsort((rest, plan))
-        keys.append((plan[order], rest[order], order))
-    return _merged(*keys[0], *keys[1])
-
-
-@kernel
-def _merged(
-    plan_a: IntArray, rest_a: IntArray, order_a: IntArray, plan_b: IntArray, rest_b: IntArray, order_b: IntArray
-) -> IntArray:
-    """Index of the equal key in the second of two sorted lists of keys (plan, rest), (n,); -1 for none."""
-    match = np.full(len(plan_a), -1, np.int64)
-    j = 0
-    for i in range(len(plan_a)):
-        while j < len(plan_b) and (plan_b[j] < plan_a[i] or (plan_b[j] == plan_a[i] and rest_b[j] < rest_a[i])):
-            j += 1
-        if j < len(plan_b) and plan_b[j] == plan_a[i] and rest_b[j] == rest_a[i]:
-            match[order_a[i]] = order_b[j]
-            j += 1
+    keys = np.concatenate([np.column_stack([a, r]), np.column_stack([b, s])])
+    order = np.lexsort(keys.T[::-1])  # in each group of equal keys the wanted ones come first
+    place = np.arange(len(order))
+    is_first = np.append(True, (np.diff(keys[order], axis=0) != 0).any(axis=1))[: len(order)]
+    start = np.flatnonzero(is_first)[np.cumsum(is_first) - 1]
+    is_offered = order >= len(a)
+    wanted_before: IntArray = np.cumsum(~is_offered) - ~is_offered
+    partner = np.full(len(order), -1, np.int64)
+    pair = place - (wanted_before - wanted_before[start])  # the first offered one goes to the first wanted one
+    partner[pair[is_offered]] = order[is_offered] - len(a)
+    match = np.empty(len(a), np.int64)
+    match[order[~is_offered]] = partner[~is_offered]
     return match
 
 

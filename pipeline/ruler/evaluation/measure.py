@@ -37,13 +37,10 @@ class Definition:
     name: str
     """Dotted, stable: `faces.completeness_10m2`."""
     group: Group
-    """Its chapter."""
     label: str
-    """A few words for tables."""
     unit: str
     """m, m2, share (0 to 1), count, or empty."""
     better: Better
-    """The better direction."""
     formula: str
     """Its computation, one line of Markdown."""
 
@@ -59,13 +56,11 @@ class Measure:
     """A measured figure."""
 
     name: str
-    """Name of its definition."""
     value: float
     """The figure; nan if the denominator is zero."""
     low: float = float("nan")
     """Lower end of the 95 % bootstrap interval; nan without one."""
     high: float = float("nan")
-    """Upper end."""
     n: int
     """Denominator: buildings, faces, points, cells."""
     subset: str = "all"

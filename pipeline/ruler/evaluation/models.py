@@ -22,7 +22,6 @@ class RoofSurface:
     coefficients: tuple[float, float, float]
     """a, b, c: rise per metre east and north, height over the origin."""
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Origin of the plane."""
     plane_id: int = -1
     """Number of its plane within the building, as in the record; -1 if it has none."""
     group: int = -1
@@ -50,13 +49,10 @@ class RoofModel:
     """A building for the measures."""
 
     building_id: str
-    """Its name."""
     footprint: Polygon | MultiPolygon
     """2D, coordinates in metres."""
     roof_type: RoofType
-    """Its claimed roof type."""
     surfaces: tuple[RoofSurface, ...]
-    """Its roof faces."""
     touches_data_edge: bool = False
     """True if it is cut by the edge of the data, or a speck of the raster: such a reference building need not be found.
     For a model it is a claim, which excuses it only at the edge of the extent of the reference."""
@@ -87,9 +83,7 @@ class ModelSet:
     name: str
     """Their name in the report: the method of a run, else the name of the file."""
     kind: Literal["run", "cityjson", "cityjsonseq", "obj"]
-    """Format."""
     path: str
-    """Path or URL."""
     models: tuple[RoofModel, ...]
     """Those with a footprint and at least one roof face, sorted by building_id."""
     failed: tuple[RoofModel, ...] = ()

@@ -16,11 +16,8 @@ class Conditions:
     """Known facts about a simulated building besides its model."""
 
     shape: str
-    """The parametric shape."""
     good: bool
-    """True without defects."""
     defects: tuple[str, ...]
-    """Reasons why it is hard."""
     pitch_deg: float
     """Slope of the steepest roof face."""
     terrain_slope_deg: float
@@ -32,7 +29,6 @@ class ReferencePoints:
     """The points of one tile, metres. All arrays have one length n."""
 
     name: str
-    """Name of the file."""
     xyz: FloatArray
     """(n, 3) float64."""
     classification: LabelArray
@@ -55,7 +51,6 @@ class Reference:
     """A reference. Made by `read_truth_reference` or `read_points_reference`."""
 
     name: str
-    """Its name in the report."""
     kind: str
     """truth (models and labelled points), or points (classes alone, with or without footprints)."""
     buildings: tuple[RoofModel, ...]

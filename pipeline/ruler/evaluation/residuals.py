@@ -93,7 +93,6 @@ class Residuals:
     all_points: Tallies
     """All roof points inside the footprint."""
     top_visible: Tallies
-    """Top-visible points."""
     counts: BoolArray
     """(buildings,) bool, False if it touches the edge of the data: it need not be found. Outlines of the raster count
     all the same: in a dense town they are connected, and the blocks that are cut have most of the points."""

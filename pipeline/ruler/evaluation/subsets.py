@@ -27,7 +27,6 @@ class Subset:
     """The reference buildings of a figure."""
 
     name: str
-    """all, good or hard."""
     buildings: BoolArray
     """(buildings,) bool, True for those in it; never those that touch the data edge."""
     elsewhere: bool

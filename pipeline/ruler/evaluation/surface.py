@@ -46,7 +46,6 @@ class SurfaceScore:
     """Distances, models minus truth, at lattice places on the true roof of each reference building."""
 
     tallies: Tallies
-    """Their sums."""
     median_m: FloatArray
     """(buildings,) median of the absolute distances where covered; nan without any."""
 

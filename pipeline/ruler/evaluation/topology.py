@@ -91,4 +91,6 @@ def face_components(
         "true_faces": n_units[held],
         "model_faces": n_faces[held],
     }
-    return components, np.where(unit_counts, kinds[of_unit], None), np.where(face_counts, kinds[of_face], None)
+    of_unit_kind, of_face_kind = kinds[of_unit], kinds[of_face]
+    of_unit_kind[~unit_counts], of_face_kind[~face_counts] = None, None
+    return components, of_unit_kind, of_face_kind

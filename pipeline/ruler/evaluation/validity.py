@@ -50,7 +50,6 @@ class ModelValidity:
     """The faults of the solids of one model."""
 
     building_id: str
-    """Id of the model."""
     codes: tuple[tuple[int, ...], ...]
     """Codes of each solid, ascending; empty for a valid one."""
     closed: tuple[bool, ...]

@@ -53,7 +53,6 @@ class Segments:
     face: IntArray
     """(n,) int64, index into `faces`; -1 for drawn edges, which have no faces."""
     faces: tuple[RoofFace, ...] = ()
-    """The roof faces."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -57,7 +57,6 @@ class WireframeScore:
     """All true buildings of a file, in the order of the wireframes."""
 
     building_ids: tuple[str, ...]
-    """Their names."""
     places: FloatArray
     """(n, 2) float64: x, y of the middle of each."""
     model_ids: tuple[tuple[str, ...], ...]
@@ -72,7 +71,7 @@ class WireframeScore:
 
     def columns(self, kind: str, tolerance: int) -> dict[str, FloatArray]:
         """Amounts of a kind, edge or corner, and what is found of them within `TOLERANCES_M[tolerance]`; (n,) each."""
-        found = {}
+        found: dict[str, FloatArray] = {}
         for side in ("true", "model"):
             amounts = self.amounts[f"{side}_{kind}s"]
             found |= {side: amounts[:, 0], f"{side}_found": amounts[:, 1 + tolerance]}

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -21,10 +20,8 @@ from pipeline.io.storage import LocalStorage
 from pipeline.report.table import CountTable
 from pipeline.ruler.evaluation.chapters import Chapter, chapters, definition_of
 from pipeline.ruler.evaluation.counts import breakdowns
-from pipeline.ruler.evaluation.definitions import DEFINITIONS
 from pipeline.ruler.evaluation.evaluate import Evaluation
 from pipeline.ruler.evaluation.markdown import markdown_cell, markdown_table
-from pipeline.ruler.evaluation.measure import Definition
 from pipeline.ruler.evaluation.model_figures import TITLE, model_figures
 from pipeline.ruler.evaluation.reading.wireframes import WireframeSet
 
@@ -53,29 +50,27 @@ _SCHEMA = pa.schema(
 )
 
 
-def write_tables(
-    evaluation: Evaluation, out_dir: str | Path, definitions: Mapping[str, Definition] = DEFINITIONS
-) -> list[Path]:
+def write_tables(evaluation: Evaluation, out_dir: str | Path) -> list[Path]:
     """Write `measures.parquet`, one Parquet file per table, and `report.md`; returns their paths in that order.
 
     Raises RunError if the folder cannot be made.
     """
     storage = LocalStorage(root=Path(out_dir))
-    storage.put(MEASURES, parquet_bytes(measures_table(evaluation, definitions)))
+    storage.put(MEASURES, parquet_bytes(measures_table(evaluation)))
     written = [MEASURES]
     crs = None if evaluation.reference is None else evaluation.reference.crs
     for name, table in evaluation.tables.items():
         storage.put(f"{name}.parquet", parquet_bytes(_with_geo(table, crs or evaluation.models.crs)))
         written.append(f"{name}.parquet")
-    storage.put(REPORT, markdown(evaluation, definitions).encode())
+    storage.put(REPORT, markdown(evaluation).encode())
     return [storage.path(key) for key in (*written, REPORT)]
 
 
-def measures_table(evaluation: Evaluation, definitions: Mapping[str, Definition] = DEFINITIONS) -> pa.Table:
+def measures_table(evaluation: Evaluation) -> pa.Table:
     """All figures: name, group, label, subset, value, low, high, n, unit, better; null for nan."""
     rows = []
     for measure in evaluation.measures:
-        definition = definition_of(measure.name, definitions)
+        definition = definition_of(measure.name)
         ends = {key: getattr(measure, key) for key in ("value", "low", "high")}
         rows.append(
             {key: value if math.isfinite(value) else None for key, value in ends.items()}
@@ -146,7 +141,7 @@ def all_notes(evaluation: Evaluation) -> tuple[str, ...]:
     return tuple(dict.fromkeys((*evaluation.models.notes, *reference, *evaluation.notes)))
 
 
-def markdown(evaluation: Evaluation, definitions: Mapping[str, Definition] = DEFINITIONS) -> str:
+def markdown(evaluation: Evaluation) -> str:
     """The report for people: models, reference, notes, one table per chapter, breakdowns, formulas."""
     measured, against = subject_sentences(evaluation)
     parts = ["# Evaluation", f"- Measured: {markdown_cell(measured)}\n- Against: {markdown_cell(against)}"]
@@ -155,7 +150,7 @@ def markdown(evaluation: Evaluation, definitions: Mapping[str, Definition] = DEF
     if notes:
         parts.append("## Notes\n\n" + "\n".join(f"- {markdown_cell(note)}" for note in notes))
     parts.append("\n\n".join([f"## {TITLE}", *(_count_table(table) for table in model_figures(evaluation))]))
-    found = chapters(evaluation, definitions)
+    found = chapters(evaluation)
     parts += [_chapter(chapter) for chapter in found]
     lost = breakdowns(evaluation.tables)
     if lost:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -50,11 +50,8 @@ class WrittenComparison:
     """A finished comparison."""
 
     summary: CompareSummary
-    """The runs."""
     evaluations: dict[str, Evaluation]
-    """Evaluations by label; empty without a reference."""
     written: tuple[Path, ...]
-    """The files beside the runs."""
 
 
 def compare_files(
@@ -111,7 +108,11 @@ def comparison_facts(request: CompareRequest, summary: CompareSummary) -> dict[s
     for variant in request.variants:
         run = summary.runs[variant.label]
         seconds = sorted(summary.seconds[variant.label].values())
-        spread = {"mean": np.mean, "median": np.median, "p95": lambda values: np.quantile(values, 0.95)}
+        spread: Mapping[str, Any] = {
+            "mean": np.mean,
+            "median": np.median,
+            "p95": lambda values: np.quantile(values, 0.95),
+        }
         variants.append(
             {
                 "label": variant.label,

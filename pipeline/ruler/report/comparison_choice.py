@@ -39,7 +39,6 @@ class Choice(NamedTuple):
 
     building: ComparedBuilding
     why: str
-    """Reason, for readers."""
 
 
 def most_different_first(buildings: Sequence[ComparedBuilding]) -> list[ComparedBuilding]:

@@ -38,7 +38,6 @@ class Cell(NamedTuple):
 
     text: str
     note: str = ""
-    """An interval, a denominator, reasons."""
 
 
 class FigureTable(NamedTuple):
@@ -46,9 +45,7 @@ class FigureTable(NamedTuple):
 
     title: str
     first: str
-    """Header of the first column."""
     rows: Sequence[tuple[str, Sequence[Cell]]]
-    """A name and one cell per run."""
 
 
 def figure_tables(runs: Sequence[ComparedRun], buildings: Sequence[ComparedBuilding]) -> tuple[FigureTable, ...]:

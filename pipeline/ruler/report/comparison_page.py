@@ -40,19 +40,12 @@ class Comparison:
     """The content of a page."""
 
     runs: tuple[ComparedRun, ...]
-    """In the order of the columns."""
     manifests: tuple[RunManifest, ...]
-    """Manifests of the runs."""
     buildings: tuple[ComparedBuilding, ...]
-    """Buildings that all runs have, by building_id."""
     left_out: int
-    """Buildings that a run with failed tiles lacks."""
     tables: tuple[FigureTable, ...]
-    """Figures side by side."""
     cases: tuple[tuple[Choice, BuildingPictures], ...]
-    """The buildings that are drawn."""
     has_points: bool
-    """Whether points were available."""
 
     @property
     def labels(self) -> list[str]:

@@ -41,13 +41,11 @@ class BuildingPictures:
     """All pictures of a building, of one width and height."""
 
     height_px: int = WIDTH_PX
-    """Height of each."""
     plan: bytes | None = None
     """Points by elevation; None without points."""
     range_m: tuple[float, float] = (math.nan, math.nan)
     """Elevations of the darkest and of the brightest points; nan without points."""
     n_points: int = 0
-    """Points in plan before thinning."""
     scale: tuple[float, float] = (1.0, 0.0)
     """Length of the scale bar in metres, and its share of the width of the plan."""
     views: tuple[bytes | None, ...] = ()

@@ -18,9 +18,7 @@ class PointFiles:
     """Point files and their options."""
 
     paths: tuple[str, ...]
-    """Point files."""
     options: ReadOptions = dataclasses.field(default_factory=ReadOptions)
-    """Options of the runs: CRS and vertical unit."""
 
 
 def points_within(files: PointFiles, areas: Sequence[shapely.Geometry]) -> list[FloatArray]:

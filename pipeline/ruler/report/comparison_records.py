@@ -47,17 +47,12 @@ class ComparedRun:
     """A run that is compared."""
 
     label: str
-    """Its label in tables and pages."""
     method: str
-    """Name of the method."""
     preset: str
-    """Name of its settings."""
     run_dir: str
-    """A finished local run directory."""
     seconds: Mapping[str, float] | None = None
     """Seconds per building, by building_id; missing ones are unknown."""
     evaluation: Evaluation | None = None
-    """Evaluation of this run; all have one reference."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -65,9 +60,7 @@ class ComparedBuilding:
     """A building in all runs."""
 
     building_id: str
-    """The same in all."""
     records: tuple[Record, ...]
-    """One per run, in their order."""
     true_id: str | None
     """Id of the reference building under it; None without one."""
     difference: Mapping[str, float]

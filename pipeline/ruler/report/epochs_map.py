@@ -6,7 +6,8 @@ from collections.abc import Callable
 
 import pyarrow as pa
 
-from pipeline.report.class_map import ROWS, ClassMap, MapClass
+from pipeline.report.class_map import ROWS, ClassMap
+from pipeline.report.maps import Entry
 from pipeline.ruler.epochs.records import Change
 from pipeline.ruler.epochs.summary import size_of
 
@@ -25,7 +26,11 @@ _DRAWN = (Change.NOT_COMPARABLE, Change.RESHAPED, Change.LOWERED, Change.RAISED,
 
 def epochs_map() -> ClassMap:
     """An empty map of changes."""
-    return ClassMap("Buildings by change", _class(Change.UNCHANGED), [_class(change) for change in _DRAWN])
+    classes = {
+        change.value: Entry(change.value.replace("_", " "), COLOURS[change], hatched=change is Change.NOT_COMPARABLE)
+        for change in (Change.UNCHANGED, *_DRAWN)
+    }
+    return ClassMap("Buildings by change", classes)
 
 
 def gathering(drawn: ClassMap) -> Callable[[pa.Table], None]:
@@ -36,9 +41,3 @@ def gathering(drawn: ClassMap) -> Callable[[pa.Table], None]:
         drawn.add(pa.table(columns, names=ROWS.names).cast(ROWS))
 
     return gather
-
-
-def _class(change: Change) -> MapClass:
-    is_hatched = change is Change.NOT_COMPARABLE
-    label = change.value.replace("_", " ")
-    return MapClass(name=change.value, label=label, colour=COLOURS[change], hatched=is_hatched)

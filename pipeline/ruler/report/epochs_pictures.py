@@ -35,13 +35,9 @@ class Case:
     """A change that is drawn."""
 
     row: Mapping[str, Any]
-    """Its row of the table."""
     plan: bytes
-    """Outlines of both epochs."""
     scale_m: float
-    """Length of the scale bar."""
     scale_share: float
-    """Its share of the plan's width."""
     old: bytes | None
     """The model of the earlier epoch; None without one."""
     new: bytes | None

@@ -10,9 +10,9 @@ import numpy as np
 import pyarrow as pa
 import shapely
 
-from pipeline.model import FloatArray, Status
-from pipeline.report.maps import BAD, DOUBTFUL, FAIR, GOOD, MISSING, UNJUDGED, Entry, Layer, Map, draw_map
-from pipeline.ruler.evaluation.counts import visible_share
+from pipeline.model import BoolArray, FloatArray, Status
+from pipeline.report.maps import BAD, DOUBTFUL, FAIR, GOOD, MISSING, UNJUDGED, Entry, Map, draw_map
+from pipeline.ruler.evaluation.counts import flags, visible_share
 from pipeline.ruler.evaluation.evaluate import Evaluation
 
 SHARES = ((0.95, "#3f86b5"), (0.9, "#8bb8d0"), (0.75, "#e3c15c"), (0.5, "#de8a3e"), (-1.0, "#c2401f"))
@@ -42,60 +42,55 @@ def maps(evaluation: Evaluation) -> list[Map]:
     return [one for one in made if one is not None]
 
 
-def _layer(
-    label: str, colour: str, geometries: Sequence[Any], chosen: Any, *, filled: bool = True, hatched: bool = False
-) -> Layer:
+def _layer(label: str, colour: str, geometries: Sequence[Any], chosen: Any, *, hatched: bool = False) -> Entry:
     """The chosen geometries."""
     picked = [geometry for geometry, is_so in zip(geometries, chosen, strict=True) if is_so]
-    entry = Entry(label=label, colour=colour, count=len(picked), hatched=hatched or not filled)
-    return Layer(entry=entry, geometries=picked, filled=filled)
+    return Entry(label, colour, len(picked), hatched, picked)
 
 
-def _missing(buildings: pa.Table) -> list[bool]:
+def _missing(buildings: pa.Table) -> BoolArray:
     """Whether no model stands for each building, and none lies over it."""
-    over = buildings["models_over"].to_pylist() if "models_over" in buildings.column_names else [0] * len(buildings)
-    return [name is None and count == 0 for name, count in zip(buildings["model_id"].to_pylist(), over, strict=True)]
+    missing = ~_found(buildings)
+    return missing & ~flags(buildings, "models_over") if "models_over" in buildings.column_names else missing
 
 
-def _torn(buildings: pa.Table, geometries: Sequence[Any]) -> Layer:
+def _found(buildings: pa.Table) -> BoolArray:
+    """Whether a model stands for each building."""
+    found: BoolArray = buildings["model_id"].is_valid().to_numpy()
+    return found
+
+
+def _torn(buildings: pa.Table, geometries: Sequence[Any]) -> Entry:
     """Buildings under models of which none stands for them, hatched over the colour of what these models found."""
-    names = buildings["model_id"].to_pylist()
-    chosen = [
-        name is None and not gone and not cut
-        for name, gone, cut in zip(names, _missing(buildings), _cut(buildings), strict=True)
-    ]
-    return _layer("wrongly divided or joined: no model stands for it", MISSING, geometries, chosen, filled=False)
+    chosen = ~_found(buildings) & ~_missing(buildings) & ~_cut(buildings)
+    return _layer("wrongly divided or joined: no model stands for it", MISSING, geometries, chosen, hatched=True)
 
 
-def _cut(buildings: pa.Table) -> list[bool]:
+def _cut(buildings: pa.Table) -> BoolArray:
     """Whether the end of the data cuts each building."""
-    if "touches_data_edge" not in buildings.column_names:
-        return [False] * buildings.num_rows
-    return [bool(value) for value in buildings["touches_data_edge"].to_pylist()]
+    known = "touches_data_edge" in buildings.column_names
+    return flags(buildings, "touches_data_edge") if known else np.zeros(buildings.num_rows, bool)
 
 
-def _outcome_layers(buildings: pa.Table, geometries: Sequence[Any]) -> list[Layer]:
+def _outcome_layers(buildings: pa.Table, geometries: Sequence[Any]) -> list[Entry]:
     """Correct, passable, false, not found, not judged."""
-    kinds = []
-    for outcome, missing, cut in zip(
-        buildings["outcome"].to_pylist(), _missing(buildings), _cut(buildings), strict=True
-    ):
-        kinds.append("unjudged" if cut or (outcome is None and not missing) else "missing" if missing else outcome)
-    named = (
-        ("unjudged", "not judged (cut by the edge of the data)", UNJUDGED),
-        ("correct", "correct", GOOD),
-        ("passable", "passable", FAIR),
-        ("false", "false", BAD),
-        ("missing", "not found", MISSING),
-    )
-    layers = [_layer(label, colour, geometries, [kind == name for kind in kinds]) for name, label, colour in named]
+    missing = _missing(buildings)
+    outcomes = np.array(buildings["outcome"].to_pylist(), object)
+    unjudged = _cut(buildings) | (~buildings["outcome"].is_valid().to_numpy() & ~missing)
+    layers = [
+        _layer("not judged (cut by the edge of the data)", UNJUDGED, geometries, unjudged),
+        *(
+            _layer(name, colour, geometries, (outcomes == name) & ~unjudged & ~missing)
+            for name, colour in (("correct", GOOD), ("passable", FAIR), ("false", BAD))
+        ),
+        _layer("not found", MISSING, geometries, missing & ~unjudged),
+    ]
     return [*layers, _torn(buildings, geometries)]
 
 
-def _share_layers(buildings: pa.Table, shares: FloatArray, geometries: Sequence[Any]) -> list[Layer]:
+def _share_layers(buildings: pa.Table, shares: FloatArray, geometries: Sequence[Any]) -> list[Entry]:
     """Classes of the share (n,) of top-visible points within 0.2 m."""
-    missing, cut = np.array(_missing(buildings), bool), np.array(_cut(buildings), bool)
-    unjudged = np.isnan(shares) | cut
+    missing, unjudged = _missing(buildings), np.isnan(shares) | _cut(buildings)
     layers = [_layer("not judged (no points, or cut by the edge of the data)", UNJUDGED, geometries, unjudged)]
     judged = ~unjudged & ~missing
     upper = math.inf
@@ -106,14 +101,15 @@ def _share_layers(buildings: pa.Table, shares: FloatArray, geometries: Sequence[
     return [*layers, _layer("not found", MISSING, geometries, ~unjudged & missing), _torn(buildings, geometries)]
 
 
-def _found_layers(buildings: pa.Table, geometries: Sequence[Any]) -> list[Layer]:
-    missing = np.array(_missing(buildings), bool)
-    found = np.array([name is not None for name in buildings["model_id"].to_pylist()], bool)
-    layers = [_layer("found", GOOD, geometries, found), _layer("not found", MISSING, geometries, missing)]
+def _found_layers(buildings: pa.Table, geometries: Sequence[Any]) -> list[Entry]:
+    layers = [
+        _layer("found", GOOD, geometries, _found(buildings)),
+        _layer("not found", MISSING, geometries, _missing(buildings)),
+    ]
     return [*layers, _torn(buildings, geometries)]
 
 
-def _false_models(evaluation: Evaluation) -> Layer:
+def _false_models(evaluation: Evaluation) -> Entry:
     """Models where no building is, hatched."""
     table = evaluation.tables.get("models")
     chosen = set()
@@ -122,10 +118,10 @@ def _false_models(evaluation: Evaluation) -> Layer:
         chosen = {name for name, role in roles if role == "false"}
     models = evaluation.models.models
     is_false = [model.building_id in chosen for model in models]
-    return _layer("model without a building", BAD, [m.footprint for m in models], is_false, filled=False)
+    return _layer("model without a building", BAD, [m.footprint for m in models], is_false, hatched=True)
 
 
-def _status_layers(evaluation: Evaluation) -> list[Layer]:
+def _status_layers(evaluation: Evaluation) -> list[Entry]:
     """The models alone: ok, doubtful, fallback, failed."""
     models, failed = evaluation.models.models, evaluation.models.failed
     footprints = [model.footprint for model in models]
@@ -143,13 +139,11 @@ def _status_layers(evaluation: Evaluation) -> list[Layer]:
     ]
 
 
-def _face_layers(faces: pa.Table, model_faces: pa.Table | None) -> list[Layer]:
+def _face_layers(faces: pa.Table, model_faces: pa.Table | None) -> list[Entry]:
     """Found, missed, not to be found; wrong ones of the models hatched over them."""
     geometries = shapely.from_wkb(np.array(faces["geometry"].to_pylist(), dtype=object))
-    found = np.array([bool(value) for value in faces["found"].to_pylist()], bool)
-    wanted = np.ones(len(found), bool)
-    if "to_be_found" in faces.column_names:
-        wanted = np.array([bool(value) for value in faces["to_be_found"].to_pylist()], bool)
+    found = flags(faces, "found")
+    wanted = flags(faces, "to_be_found") if "to_be_found" in faces.column_names else np.ones(len(found), bool)
     layers = [
         _layer("too small, too sparse or cut: need not be found", UNJUDGED, geometries, ~wanted & ~found),
         _layer("found, though it need not be", "#8bb8d0", geometries, ~wanted & found),
@@ -158,6 +152,6 @@ def _face_layers(faces: pa.Table, model_faces: pa.Table | None) -> list[Layer]:
     ]
     if model_faces is not None and {"wrong", "geometry"} <= set(model_faces.column_names):
         made = shapely.from_wkb(np.array(model_faces["geometry"].to_pylist(), dtype=object))
-        wrong = [bool(value) for value in model_faces["wrong"].to_pylist()]
-        layers.append(_layer("modelled face that matches none", BAD, made, wrong, filled=False))
+        wrong = flags(model_faces, "wrong")
+        layers.append(_layer("modelled face that matches none", BAD, made, wrong, hatched=True))
     return layers

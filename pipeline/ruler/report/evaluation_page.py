@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +11,7 @@ from pipeline.report.page_template import page_template
 from pipeline.report.pictures import data_uri
 from pipeline.ruler.evaluation.chapters import Chapter, Line, chapters
 from pipeline.ruler.evaluation.counts import breakdowns
-from pipeline.ruler.evaluation.definitions import DEFINITIONS
 from pipeline.ruler.evaluation.evaluate import Evaluation
-from pipeline.ruler.evaluation.measure import Definition
 from pipeline.ruler.evaluation.model_figures import TITLE, model_figures
 from pipeline.ruler.evaluation.writing import INTERVALS, all_notes, subject_sentences
 from pipeline.ruler.report.evaluation_maps import maps
@@ -47,18 +45,16 @@ HEADLINE_FIGURES = 8
 """Largest number."""
 
 
-def write_page(
-    evaluation: Evaluation, out_dir: str | Path, definitions: Mapping[str, Definition] = DEFINITIONS
-) -> Path:
+def write_page(evaluation: Evaluation, out_dir: str | Path) -> Path:
     """Write `report.html` with its images and styles; RunError if the folder cannot be created."""
     storage = LocalStorage(root=Path(out_dir))
-    storage.put(PAGE, page(evaluation, definitions).encode())
+    storage.put(PAGE, page(evaluation).encode())
     return storage.path(PAGE)
 
 
-def page(evaluation: Evaluation, definitions: Mapping[str, Definition] = DEFINITIONS) -> str:
+def page(evaluation: Evaluation) -> str:
     """The page as text."""
-    found = chapters(evaluation, definitions)
+    found = chapters(evaluation)
     measured, against = subject_sentences(evaluation)
     name = evaluation.models.name
     truth = evaluation.reference or evaluation.wireframes

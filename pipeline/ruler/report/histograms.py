@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import math
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
 from markupsafe import Markup
 
 from pipeline.model import BoolArray, FloatArray
-from pipeline.ruler.evaluation.counts import floats, visible_share
+from pipeline.ruler.evaluation.counts import flags, floats, visible_share
 from pipeline.ruler.report.svg_chart import Axis, Ordinate, category_svg, histogram_svg, rebinned
 
 GOOD_M = 0.2
@@ -24,16 +24,12 @@ _MIN_FACE_M2 = 10.0
 _SLOPES_DEG = (0.0, 7.0, 20.0, 30.0, 40.0, 50.0, 90.0)
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Chart:
-    """A chart with its words."""
+class Chart(NamedTuple):
+    """A chart with its words; `svg` is an inline SVG."""
 
     title: str
-    """Title."""
     svg: Markup
-    """An inline SVG."""
     caption: str
-    """Caption."""
 
 
 def charts(tables: Mapping[str, pa.Table]) -> list[Chart]:
@@ -131,70 +127,53 @@ def _plain(
 def _of_buildings(table: pa.Table) -> list[Chart | None]:
     """Agreement building by building."""
     names = set(table.column_names)
-    made: list[Chart | None] = []
-    shares = visible_share(table)
-    if shares is not None:
-        made.append(
-            _plain(
-                shares,
-                np.linspace(0.0, 1.0, 41),
-                title="Points within 0.2 m, by building",
-                x_name="share of the building's top-visible points",
-                what="buildings",
-                percent=True,
-            )
-        )
+    values = {name: _of_found(table, name) for name in ("iou", "area_bias") if name in names}
     if "surface_within" in names:
-        made.append(
-            _plain(
-                floats(table, "surface_within"),
-                np.linspace(0.0, 1.0, 41),
-                title="True roof within 0.2 m, by building",
-                x_name="share of the roof's area",
-                what="buildings",
-                percent=True,
-            )
+        values["surface_within"] = floats(table, "surface_within")
+    if (shares := visible_share(table)) is not None:
+        values["points_within"] = shares
+    unit, bias = np.linspace(0.0, 1.0, 41), np.linspace(-0.5, 0.5, 41)
+    visible = "share of the building's top-visible points"
+    beyond = "The outermost bars include all values beyond."
+    return [
+        _plain(
+            values[name],
+            edges,
+            title=title,
+            x_name=x_name,
+            what="buildings",
+            caption=words,
+            percent=name != "iou",
+            marks=(0.0,) if name == "area_bias" else (),
         )
-    if "iou" in names:
-        made.append(
-            _plain(
-                _of_found(table, "iou"),
-                np.linspace(0.0, 1.0, 41),
-                title="Footprint IoU of found buildings",
-                x_name="intersection over union",
-                what="buildings",
-                caption="One to one.",
-            )
+        for name, edges, title, x_name, words in (
+            (
+                "points_within",
+                unit,
+                "Points within 0.2 m, by building",
+                visible,
+                "",
+            ),
+            ("surface_within", unit, "True roof within 0.2 m, by building", "share of the roof's area", ""),
+            ("iou", unit, "Footprint IoU of found buildings", "intersection over union", "One to one."),
+            ("area_bias", bias, "Area bias of footprints", "modelled over true area, minus 1", beyond),
         )
-    if "area_bias" in names:
-        made.append(
-            _plain(
-                _of_found(table, "area_bias"),
-                np.linspace(-0.5, 0.5, 41),
-                title="Area bias of footprints",
-                x_name="modelled over true area, minus 1",
-                what="buildings",
-                percent=True,
-                marks=(0.0,),
-                caption="The outermost bars include all values beyond.",
-            )
-        )
-    return made
+        if name in values
+    ]
 
 
 def _of_found(table: pa.Table, name: str) -> FloatArray:
     """A column over the buildings that were found."""
     values = floats(table, name)
     if "model_id" in table.column_names:
-        found: BoolArray = table["model_id"].is_valid().to_numpy(zero_copy_only=False).astype(bool)
-        values = values[found]
+        values = values[table["model_id"].is_valid().to_numpy()]
     return values
 
 
 def _of_faces(table: pa.Table) -> list[Chart | None]:
     """Agreement of found faces, and completeness by class."""
     names = set(table.column_names)
-    found = np.array([bool(value) for value in table["found"].to_pylist()], bool)
+    found = flags(table, "found")
     made: list[Chart | None] = []
     for name, edges, title, x_name, marks in (
         ("angle_deg", np.linspace(0.0, 10.0, 41), "Angle to the true face", "degrees", ()),
@@ -208,7 +187,7 @@ def _of_faces(table: pa.Table) -> list[Chart | None]:
     areas = floats(table, "area_m2")
     counted = areas >= _MIN_FACE_M2
     if "to_be_found" in names:
-        counted = np.array([bool(value) for value in table["to_be_found"].to_pylist()], bool)
+        counted = flags(table, "to_be_found")
     classed = counted | (areas < _MIN_FACE_M2)
     title, x_name = "Faces found, by area", "area of the true face, m²"
     made.append(_completeness(areas[classed], found[classed], _FACE_AREAS_M2, title, x_name, True))
@@ -225,13 +204,11 @@ def _completeness(
     """Shares of found faces, by classes of `values`."""
     if len(values) == 0:
         return None
-    names, shares, counts, pale = [], [], [], []
-    for low, high in itertools.pairwise(borders):
-        chosen = (values >= low) & (values < high)
-        names.append(f"{low:g}-{high:g}" if math.isfinite(high) else f"> {low:g}")
-        counts.append(int(chosen.sum()))
-        shares.append(float(found[chosen].mean()) if chosen.any() else math.nan)
-        pale.append(by_area and high <= _MIN_FACE_M2)
+    bins = list(itertools.pairwise(borders))
+    within = [found[(values >= low) & (values < high)] for low, high in bins]
+    names = [f"{low:g}-{high:g}" if math.isfinite(high) else f"> {low:g}" for low, high in bins]
+    counts, shares = [len(one) for one in within], [float(one.mean()) if len(one) else math.nan for one in within]
+    pale = [by_area and high <= _MIN_FACE_M2 for _, high in bins]
     classes = "; ".join(
         f"{name}: {100.0 * share:.0f} % of {count:,}"
         for name, share, count in zip(names, shares, counts, strict=True)

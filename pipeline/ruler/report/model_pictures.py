@@ -87,15 +87,10 @@ class ModelsView:
     """A bird's-eye view of models that are measured without a reference, with its words."""
 
     png: bytes
-    """The picture."""
     width_px: int
-    """Its width."""
     height_px: int
-    """Its height."""
     legend: tuple[Entry, ...]
-    """Roof types in it, with their numbers."""
     caption: str
-    """What it shows."""
 
 
 def models_view(models: Sequence[RoofModel]) -> ModelsView | None:

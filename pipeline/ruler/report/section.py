@@ -8,11 +8,11 @@ from collections.abc import Sequence
 
 import numpy as np
 import shapely
-from markupsafe import Markup, escape
+from markupsafe import Markup
 
 from pipeline.model import FloatArray, LabelArray
 from pipeline.ruler.evaluation.models import RoofModel
-from pipeline.ruler.report.svg_chart import ticks
+from pipeline.ruler.report.svg_chart import line, polyline, svg, text, ticks
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -22,9 +22,7 @@ class ResidualClass:
     low_m: float
     """Lower end; nan: no roof at the point."""
     colour: str
-    """As #rrggbb."""
     label: str
-    """For the legend."""
 
 
 RESIDUAL_CLASSES = (
@@ -89,12 +87,9 @@ def section_svg(truth: RoofModel, models: Sequence[RoofModel], xyz: FloatArray) 
         for (place, z), kind in zip(near, kinds, strict=True)
     ]
     for name, top in roofs.items():
-        parts += [f'<polyline class="{name}" points="{line}"/>' for line in frame.lines(s, top, walls=name == "model")]
+        parts += [polyline(name, corners) for corners in frame.lines(s, top, walls=name == "model")]
     label = f"Section across {truth.building_id}: {len(near)} points" + ("" if models else "; no model stands here")
-    head = (
-        f'<svg class="section" viewBox="0 0 {_WIDTH:.0f} {frame.height:.0f}" role="img" aria-label="{escape(label)}">'
-    )
-    return Markup(head + "".join(parts) + "</svg>")  # noqa: S704 -- the only text from outside is escaped above
+    return svg("section", _WIDTH, frame.height, label, parts)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -132,19 +127,16 @@ class _Frame:
         parts = []
         for tick in ticks(self.floor_m, self.high_m + 0.5, 3):
             place = self.down(tick)
-            parts.append(f'<line class="grid" x1="{_LEFT}" x2="{_WIDTH - _RIGHT}" y1="{place:.1f}" y2="{place:.1f}"/>')
-            parts.append(f'<text class="tick" x="{_LEFT - 4}" y="{place + 3.5:.1f}" text-anchor="end">{tick:g}</text>')
-        parts.append(f'<line class="axis" x1="{_LEFT}" x2="{_WIDTH - _RIGHT}" y1="{floor:.1f}" y2="{floor:.1f}"/>')
-        parts += [
-            f'<text class="tick" x="{self.across(tick):.1f}" y="{floor + 14:.1f}" text-anchor="middle">{tick:g}</text>'
-            for tick in ticks(self.left_m, self.right_m, 5)
-        ]
-        middle = (_LEFT + _WIDTH - _RIGHT) / 2.0
+            parts.append(line("grid", _LEFT, _WIDTH - _RIGHT, place, place))
+            parts.append(text("tick", _LEFT - 4.0, place + 3.5, f"{tick:g}", anchor="end"))
+        parts.append(line("axis", _LEFT, _WIDTH - _RIGHT, floor, floor))
+        across = ticks(self.left_m, self.right_m, 5)
+        parts += [text("tick", self.across(tick), floor + 14.0, f"{tick:g}") for tick in across]
         name = "metres across the building; elevation upwards, same scale"
-        parts.append(f'<text class="name" x="{middle}" y="{self.height - 6:.1f}" text-anchor="middle">{name}</text>')
+        parts.append(text("name", (_LEFT + _WIDTH - _RIGHT) / 2.0, self.height - 6.0, name))
         return parts
 
-    def lines(self, s: FloatArray, top: FloatArray, *, walls: bool) -> list[str]:
+    def lines(self, s: FloatArray, top: FloatArray, *, walls: bool) -> list[list[tuple[float, float]]]:
         """The pieces of a roof line, optionally with walls down to the floor."""
         known = np.isfinite(top)
         borders = np.flatnonzero(np.diff(known.astype(np.int8), prepend=0, append=0))
@@ -154,7 +146,7 @@ class _Frame:
             if walls:
                 floor = self.height - _BOTTOM
                 corners = [(corners[0][0], floor), *corners, (corners[-1][0], floor)]
-            found.append(" ".join(f"{x:.1f},{y:.1f}" for x, y in corners))
+            found.append(corners)
         return found
 
 

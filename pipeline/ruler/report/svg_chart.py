@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 from markupsafe import Markup, escape
@@ -24,9 +24,7 @@ class Axis:
     """Labels of an axis."""
 
     name: str
-    """Name and unit."""
     text: Callable[[float], str]
-    """Text of a tick."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -34,11 +32,8 @@ class Ordinate:
     """The vertical axis: from values to pixels of the view box."""
 
     low: float
-    """Lowest value shown; > 0 on a logarithmic axis."""
     high: float
-    """Highest value shown."""
     log: bool
-    """True for a logarithmic axis."""
 
     def place(self, value: float) -> float:
         """Pixels from the top."""
@@ -102,20 +97,14 @@ def histogram_svg(
         held = np.flatnonzero(steps > 0.0)
         last = int(held[-1]) + 1 if len(held) else 0
         places = [ordinate.place(float(step)) if step > 0.0 else floor for step in steps[:last]]
-        corners = [
-            f"{across(border):.1f},{place:.1f}"
-            for low, high, place in zip(edges[:last], edges[1 : last + 1], places, strict=True)
-            for border in (low, high)
-        ]
-        parts.append(f'<polyline class="line-b" points="{" ".join(corners)}"/>')
+        borders = zip(edges[:last], edges[1 : last + 1], places, strict=True)
+        parts.append(polyline("line-b", [(across(border), y) for *both, y in borders for border in both]))
     for mark in marks:
         if left < mark < right:
-            parts.append(
-                f'<line class="mark" x1="{across(mark):.1f}" x2="{across(mark):.1f}" y1="{_TOP}" y2="{floor}"/>'
-            )
+            parts.append(line("mark", across(mark), across(mark), _TOP, floor))
     for tick in ticks(left, right, 5):
-        parts.append(_text("tick", across(tick), floor + 14.0, x.text(tick)))
-    return _svg(parts, x.name, description)
+        parts.append(text("tick", across(tick), floor + 14.0, x.text(tick)))
+    return _chart(parts, x.name, description)
 
 
 def category_svg(
@@ -141,9 +130,9 @@ def category_svg(
         top = floor if math.isnan(share) else ordinate.place(float(share))
         kind = "bar pale" if pale and pale[place] else "bar"
         parts.append(_bar(kind, middle - 0.36 * step, top, 0.72 * step))
-        parts.append(_text("tick", middle, top - 4.0, f"{count:,}"))
-        parts.append(_text("tick", middle, floor + 14.0, name))
-    return _svg(parts, x_name, description)
+        parts.append(text("tick", middle, top - 4.0, f"{count:,}"))
+        parts.append(text("tick", middle, floor + 14.0, name))
+    return _chart(parts, x_name, description)
 
 
 def _frame(ordinate: Ordinate, y: Axis) -> list[str]:
@@ -152,11 +141,11 @@ def _frame(ordinate: Ordinate, y: Axis) -> list[str]:
     parts = []
     for tick in ordinate.ticks:
         place = ordinate.place(tick)
-        parts.append(f'<line class="grid" x1="{_LEFT}" x2="{WIDTH - _RIGHT}" y1="{place:.1f}" y2="{place:.1f}"/>')
-        parts.append(_text("tick", _LEFT - 4.0, place + 3.5, y.text(tick), anchor="end"))
-    parts.append(f'<line class="axis" x1="{_LEFT}" x2="{WIDTH - _RIGHT}" y1="{floor}" y2="{floor}"/>')
+        parts.append(line("grid", _LEFT, WIDTH - _RIGHT, place, place))
+        parts.append(text("tick", _LEFT - 4.0, place + 3.5, y.text(tick), anchor="end"))
+    parts.append(line("axis", _LEFT, WIDTH - _RIGHT, floor, floor))
     middle = (_TOP + floor) / 2.0
-    parts.append(_text("name", 11.0, middle, y.name, turned=True))
+    parts.append(text("name", 11.0, middle, y.name, turned=True))
     return parts
 
 
@@ -167,18 +156,32 @@ def _bar(kind: str, left: float, top: float, width: float) -> str:
     )
 
 
-def _text(kind: str, x: float, y: float, text: str, *, anchor: str = "middle", turned: bool = False) -> str:
+def line(kind: str, x1: float, x2: float, y1: float, y2: float) -> str:
+    """A straight line."""
+    return f'<line class="{kind}" x1="{x1:.1f}" x2="{x2:.1f}" y1="{y1:.1f}" y2="{y2:.1f}"/>'
+
+
+def polyline(kind: str, corners: Iterable[tuple[float, float]]) -> str:
+    """A line over many places."""
+    return f'<polyline class="{kind}" points="{" ".join(f"{x:.1f},{y:.1f}" for x, y in corners)}"/>'
+
+
+def text(kind: str, x: float, y: float, words: str, *, anchor: str = "middle", turned: bool = False) -> str:
     """An escaped text."""
     turn = f' transform="rotate(-90 {x:.1f} {y:.1f})"' if turned else ""
-    return f'<text class="{kind}" x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}"{turn}>{escape(text)}</text>'
+    return f'<text class="{kind}" x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}"{turn}>{escape(words)}</text>'
 
 
-def _svg(parts: Sequence[str], x_name: str, description: str) -> Markup:
-    """The element around everything, with the name of the horizontal axis."""
-    middle = (_LEFT + WIDTH - _RIGHT) / 2.0
-    name = _text("name", middle, HEIGHT - 6.0, x_name)
-    head = f'<svg class="chart" viewBox="0 0 {WIDTH:.0f} {HEIGHT:.0f}" role="img" aria-label="{escape(description)}">'
-    return Markup(head + "".join(parts) + name + "</svg>")  # noqa: S704 -- every text in it is escaped above
+def _chart(parts: Sequence[str], x_name: str, description: str) -> Markup:
+    """A chart of parts, with the name of the horizontal axis."""
+    name = text("name", (_LEFT + WIDTH - _RIGHT) / 2.0, HEIGHT - 6.0, x_name)
+    return svg("chart", WIDTH, HEIGHT, description, [*parts, name])
+
+
+def svg(kind: str, width: float, height: float, description: str, parts: Iterable[str]) -> Markup:
+    """The element around all parts, whose texts are escaped."""
+    head = f'<svg class="{kind}" viewBox="0 0 {width:.0f} {height:.0f}" role="img" aria-label="{escape(description)}">'
+    return Markup(head + "".join(parts) + "</svg>")  # noqa: S704 -- every text in it is escaped
 
 
 def rebinned(edges_low: FloatArray, edges_high: FloatArray, counts: FloatArray, edges: FloatArray) -> FloatArray:

@@ -33,6 +33,23 @@ SIDE_PX = 560
 """Width and height of a picture."""
 MODEL_COLOUR, SECTION_COLOUR = "#7f93a6", "#777d86"
 _MARGIN_M = 1.5
+_CAPTION = (
+    ("outcome", "outcome", "{}"),
+    ("roof type", "type", "{}"),
+    ("model", "model", "{}"),
+    ("shape", "shape", "{}"),
+    ("made hard by", "made_hard_by", "{}"),
+    ("status", "model_status", "{}"),
+    ("faces", "faces", "{}"),
+    ("top points within 0.2 m", "top_within", "{}"),
+    ("points within 0.2 m", "within", "{}"),
+    ("roof within 0.2 m", "roof", "{:.1f} %"),
+    ("RMSE of the top points", "top_rmse_m", "{:.3f} m"),
+    ("point RMSE", "point_rmse_m", "{:.3f} m"),
+    ("footprint IoU", "iou", "{:.2f}"),
+    ("footprint", "footprint_area_m2", "{:.0f} m²"),
+)
+"""Figures of a caption: label, column or name, text."""
 _BADNESS = {"false": 0, "passable": 1, "correct": 2}
 
 
@@ -41,15 +58,12 @@ class Case:
     """One building with its pictures."""
 
     building_id: str
-    """Id of the reference building."""
     figures: tuple[tuple[str, str], ...]
-    """Name and text of each figure of the caption."""
     plan_png: bytes
     """Faces of the models with the points over them, true outlines dashed."""
     view_png: bytes | None
     """The model from the south, else the true one; None if neither has faces."""
     view_is_truth: bool
-    """Whether the view shows the truth."""
     section: Markup | None
     """An SVG of the profile across the building; None without any faces."""
 
@@ -162,45 +176,30 @@ def _case(
 
 def _figures(row: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
     """The caption, as far as known."""
-
-    def known(name: str) -> bool:
-        value = row.get(name)
-        return value is not None and not (isinstance(value, float) and math.isnan(value))
-
-    figures: list[tuple[str, str]] = []
-    if known("outcome"):
-        figures.append(("outcome", str(row["outcome"])))
-    true_type = row.get("true_type")
-    if true_type not in {None, "none", "unknown"}:
-        model_type = row.get("model_type")
-        made = "not found" if row.get("model_id") is None else str(model_type or "?")
-        figures.append(("roof type", f"{true_type}, modelled: {made}"))
+    known = {
+        name: value
+        for name, value in row.items()
+        if value is not None and not (isinstance(value, float) and math.isnan(value))
+    }
+    modelled = "not found" if row.get("model_id") is None else str(row.get("model_type") or "")
+    if known.get("true_type", "none") not in {"none", "unknown"}:
+        known["type"] = f"{row['true_type']}, modelled: {modelled or '?'}"
     elif "model_id" in row:
-        figures.append(("model", "not found" if row["model_id"] is None else str(row.get("model_type") or "found")))
-    if known("shape"):
-        figures.append(("shape", str(row["shape"])))
-    if row.get("defects"):
-        figures.append(("made hard by", ", ".join(row["defects"])))
-    if known("model_status") and row["model_status"] != "ok":
-        figures.append(("status", str(row["model_status"])))
-    if known("faces_to_find"):
-        figures.append(
-            ("faces", f"{row['faces_found']} of {row['faces_to_find']} found, {row.get('faces_wrong') or 0} wrong")
-        )
+        known["model"] = modelled or "found"
+    if known.get("model_status") == "ok":
+        del known["model_status"]
+    known["made_hard_by"] = ", ".join(row.get("defects") or ())
+    if "faces_to_find" in known:
+        wrong = row.get("faces_wrong") or 0
+        known["faces"] = f"{row['faces_found']} of {row['faces_to_find']} found, {wrong} wrong"
+    if "surface_within" in known:
+        known["roof"] = 100.0 * row["surface_within"]
     prefix = _points_of_row(row)
-    if known(f"{prefix}n_points") and (n_points := row[f"{prefix}n_points"]):
-        share = f"{100.0 * row[f'{prefix}n_within'] / n_points:.1f} % of {n_points:,}"
-        figures.append(("top points within 0.2 m" if prefix else "points within 0.2 m", share))
-    if known("surface_within"):
-        figures.append(("roof within 0.2 m", f"{100.0 * row['surface_within']:.1f} %"))
-    rmse = "top_rmse_m" if prefix else "point_rmse_m"
-    if known(rmse):
-        figures.append(("RMSE of the top points" if prefix else "point RMSE", f"{row[rmse]:.3f} m"))
-    if known("iou"):
-        figures.append(("footprint IoU", f"{row['iou']:.2f}"))
-    if known("footprint_area_m2"):
-        figures.append(("footprint", f"{row['footprint_area_m2']:.0f} m²"))
-    return tuple(figures)
+    if n_points := known.get(f"{prefix}n_points"):
+        known[f"{prefix}within"] = f"{100.0 * row[f'{prefix}n_within'] / n_points:.1f} % of {n_points:,}"
+    known.pop("point_rmse_m" if prefix else "top_rmse_m", None)
+    held = ((label, text, known.get(name)) for label, name, text in _CAPTION)
+    return tuple((label, text.format(value)) for label, text, value in held if value not in {None, ""})
 
 
 def _square(truth: RoofModel, own: Sequence[RoofModel]) -> tuple[float, float, float]:

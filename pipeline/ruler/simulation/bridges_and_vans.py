@@ -49,10 +49,8 @@ def bridges_and_vans(seed: int) -> Scene:
     return Scene(
         name="bridges_and_vans",
         origin=(569_000.0, 5_938_000.0, 0.0),
-        crs="EPSG:25832+7837",
         extent=(-_CUTTING_M / 4, 0.0, _CUTTING_M * (_CUTTINGS + 0.25), length),
         terrain=terrain,
-        buildings=(),
         boxes=(*bridges, *vans),
     )
 
@@ -72,5 +70,5 @@ def _van(x: float, ends: tuple[float, float], terrain: Terrain, random: np.rando
     """A vehicle that stands from one northing to another."""
     middle, half = (ends[0] + ends[1]) / 2, float(random.uniform(*VAN_WIDTH_M)) / 2
     corners = np.array([(x - half, ends[0]), (x + half, ends[0]), (x + half, ends[1]), (x - half, ends[1])])
-    ground = float(terrain.elevation(np.array([x]), np.array([middle]))[0])
+    ground = terrain.at(x, middle)
     return Box(corners=corners, top_z_m=ground + float(random.uniform(*VAN_HEIGHT_M)))

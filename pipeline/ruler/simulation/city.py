@@ -104,7 +104,6 @@ class CityPlan:
         return Scene(
             name=self.name,
             origin=(564_000.0, 5_938_000.0, 0.0),
-            crs="EPSG:25832+7837",
             extent=extent,
             terrain=self.terrain,
             buildings=tuple(

@@ -16,7 +16,6 @@ import shapely
 
 from pipeline.model import FloatArray
 from pipeline.ruler.simulation.additions import can_have_dormers, random_dormers, random_superstructures
-from pipeline.ruler.simulation.conditions import terrain_slope_deg
 from pipeline.ruler.simulation.plots import PlannedBuilding
 from pipeline.ruler.simulation.random_dimensions import random_dimensions
 from pipeline.ruler.simulation.roofs import RoofDimensions, RoofShape
@@ -111,7 +110,7 @@ class Block(StreetBlock):
         shares = np.array(list(_SHARES.values()))
         kind = list(_SHARES)[int(np.searchsorted(np.cumsum(shares) / shares.sum(), self.random.random()))]
         corners = [self._place(u, v) for u in (-40.0, 0.0, 40.0) for v in (-25.0, 25.0)]
-        if max(terrain_slope_deg(self.terrain, x, y) for x, y in corners) > _STEEP_DEG:
+        if max(self.terrain.slope_deg(x, y) for x, y in corners) > _STEEP_DEG:
             return BlockKind.PARK if kind in {BlockKind.PARK, BlockKind.HALL} else BlockKind.DETACHED
         return kind
 

@@ -25,13 +25,12 @@ from typing import Any
 
 from pipeline.errors import InputError, SettingsError
 from pipeline.ruler.simulation.als import ScannerSettings, scan, strip_count
-from pipeline.ruler.simulation.conditions import write_conditions
 from pipeline.ruler.simulation.scene import Scene
 from pipeline.ruler.simulation.strips import Returns, survey_extent
 from pipeline.ruler.simulation.suites import Suite, suite_named
 from pipeline.ruler.simulation.survey_files import TileFiles, recorded, write_points
 from pipeline.ruler.simulation.sweep import Cell, chosen_cells
-from pipeline.ruler.simulation.truth_files import write_manifest, write_models
+from pipeline.ruler.simulation.truth_files import write_conditions, write_manifest, write_models
 
 _BUILDINGS_PER_PART = 500
 """Buildings per file of the exact models."""
@@ -58,11 +57,9 @@ class ScenePaths:
     labels: Path
     """Per-point truth, or the folder of it for several tiles."""
     points: int
-    """Returns in all tiles."""
     buildings: int
     """Buildings in the scene, or in all cells together."""
     tiles: int = 1
-    """LAZ files."""
     cells: tuple[ScenePaths, ...] = ()
     """The files of every cell of a suite of several surveys."""
 
@@ -133,10 +130,7 @@ def simulate(
     out = Path(out_dir)
     if plan.cells:
         return _simulate_cells(request, chosen_cells(plan.cells, density_per_m2, noise_m), out)
-    request = request.surveyed(density_per_m2, noise_m)
-    if plan.part is not None:
-        return _simulate_tiles(request, out)
-    return _simulate_one(request, plan.make(seed, request.size_m), out)
+    return _simulate_tiles(request.surveyed(density_per_m2, noise_m), None, out)
 
 
 def _sloped(plan: Suite, slope_deg: float) -> Suite:
@@ -197,32 +191,6 @@ class _Request:
         return write_points(blocks, scene, laz, labels, self.output.with_classes, on_points)
 
 
-def _simulate_one(request: _Request, scene: Scene, out: Path, before: int = 0) -> ScenePaths:
-    """A data set of one tile."""
-    truth = _emptied(out, request.plan.name)
-    laz, labels = out / f"{request.plan.name}.laz", truth / "labels.parquet"
-    tile = request.write_tile(scene, laz, labels, before)
-    if tile.points == 0:
-        raise InputError(str(laz), "the survey hit nothing", "Use a larger scene or a higher density")
-    rows = []
-    for first in range(0, max(1, len(scene.buildings)), _BUILDINGS_PER_PART):  # a scene without buildings has one part
-        part = f"part{first // _BUILDINGS_PER_PART:05d}"
-        rows += write_models(scene.buildings[first : first + _BUILDINGS_PER_PART], scene, request.scanner, truth, part)
-    write_conditions(rows, truth / "conditions.parquet")
-    write_manifest(
-        scene,
-        request.scanner,
-        request.seed,
-        [tile],
-        truth,
-        strips=strip_count(scene, request.scanner),
-        buildings=len(scene.buildings),
-        trees=len(scene.trees),
-        cars=len(scene.boxes),
-    )
-    return ScenePaths(laz=laz, truth=truth, labels=labels, points=tile.points, buildings=len(scene.buildings))
-
-
 def _emptied(out: Path, suite: str) -> Path:
     """The folder of the truth, created if missing, without the files of an earlier call."""
     truth = out / "truth"
@@ -268,7 +236,7 @@ def _simulate_cells(request: _Request, cells: tuple[Cell, ...], out: Path) -> Sc
     made: list[ScenePaths] = []
     for cell in cells:
         here = scene if make_for is None else make_for(request.seed, cell.key)
-        made.append(_simulate_one(request.of_cell(cell), here, out / cell.key, sum(one.points for one in made)))
+        made.append(_simulate_tiles(request.of_cell(cell), here, out / cell.key, sum(one.points for one in made)))
     listed = [
         {"cell": cell.key, "density_per_m2": cell.density_per_m2, "noise_m": cell.noise_m, "points": one.points}
         for cell, one in zip(cells, made, strict=True)
@@ -286,34 +254,41 @@ def _simulate_cells(request: _Request, cells: tuple[Cell, ...], out: Path) -> Sc
     )
 
 
-def _simulate_tiles(request: _Request, out: Path) -> ScenePaths:
-    """A data set of many tiles: the whole scene is never in memory.
+def _simulate_tiles(request: _Request, scene: Scene | None, out: Path, before: int = 0) -> ScenePaths:
+    """A data set of one tile (a given scene, else that of the suite), or of many: never in memory as a whole.
 
-    While one tile is scanned and written, one thread lays out the next and writes the models of the one before.
+    While one tile is scanned and written, one thread lays out the next and writes the models of the one before. Earlier
+    data sets have `before` points.
     """
-    size, plan, settings = request.size_m, request.plan, request.scanner
-    if plan.part is None:
-        raise TypeError(f"{plan.name} is not made tile by tile")
+    plan, settings = request.plan, request.scanner
     truth = _emptied(out, plan.name)
-    tiles_dir, labels_dir = out / "tiles", truth / "labels"
-    for folder in (tiles_dir, labels_dir):
-        folder.mkdir(parents=True, exist_ok=True)
-    part_of = plan.part(request.seed, size, settings)
-    output = dataclasses.replace(request.output, chunk_points=min(request.output.chunk_points, _TILED_CHUNK_POINTS))
-    request = dataclasses.replace(request, output=output)
+    laz_dir, labels_dir, todo = out, truth, [("", (0.0, 0.0, *request.size_m))]
+    if plan.part is not None:
+        part_of = plan.part(request.seed, request.size_m, settings)
+        chunk_points = min(request.output.chunk_points, _TILED_CHUNK_POINTS)
+        request = dataclasses.replace(request, output=dataclasses.replace(request.output, chunk_points=chunk_points))
+        laz_dir, labels_dir, todo = out / "tiles", truth / "labels", list(tile_extents(request.size_m, plan.tile_m))
+        for folder in (laz_dir, labels_dir):
+            folder.mkdir(parents=True, exist_ok=True)
+    else:
+        whole = scene or plan.make(request.seed, request.size_m)
+
+        def part_of(_: Extent) -> Scene:
+            return whole
+
     tiles: list[TileFiles] = []
     truths: list[Future[_TileTruth]] = []
     points = 0
-    todo = list(tile_extents(size, plan.tile_m))
     with ThreadPoolExecutor(1) as aside:
         ahead = aside.submit(part_of, todo[0][1])
         for number, (key, extent) in enumerate(todo):
-            scene = ahead.result()
+            here = ahead.result()
             if number + 1 < len(todo):
                 ahead = aside.submit(part_of, todo[number + 1][1])
-            truths.append(aside.submit(_tile_truth, scene, settings, extent, truth, key))
-            laz, labels = tiles_dir / f"{plan.name}_{key}.laz", labels_dir / f"{key}.parquet"
-            made = request.write_tile(scene, laz, labels, points)
+            truths.append(aside.submit(_tile_truth, here, settings, extent if key else None, truth, key))
+            laz = laz_dir / f"{plan.name}{'_' if key else ''}{key}.laz"
+            labels = labels_dir / f"{key or 'labels'}.parquet"
+            made = request.write_tile(here, laz, labels, before + points)
             points += made.points
             if made.points:
                 tiles.append(made)
@@ -322,22 +297,27 @@ def _simulate_tiles(request: _Request, out: Path) -> ScenePaths:
                 labels.unlink()
         known = [future.result() for future in truths]
     if points == 0:
-        raise InputError(str(tiles_dir), "the survey hit nothing", "Use a larger scene or a higher density")
+        raise InputError(str(laz_dir), "the survey hit nothing", "Use a larger scene or a higher density")
     rows = [row for one in known for row in one.rows]
     write_conditions(rows, truth / "conditions.parquet")
     write_manifest(
-        scene,
+        here,
         settings,
         request.seed,
         tiles,
         truth,
-        strips=strip_count(scene, settings),
+        strips=strip_count(here, settings),
         buildings=len(rows),
         trees=sum(one.trees for one in known),
         cars=sum(one.cars for one in known),
     )
     return ScenePaths(
-        laz=tiles_dir, truth=truth, labels=labels_dir, points=points, buildings=len(rows), tiles=len(tiles)
+        laz=laz_dir if plan.part is not None else tiles[0].laz,
+        truth=truth,
+        labels=labels_dir if plan.part is not None else tiles[0].labels,
+        points=points,
+        buildings=len(rows),
+        tiles=len(tiles),
     )
 
 
@@ -350,15 +330,21 @@ class _TileTruth:
     cars: int
 
 
-def _tile_truth(scene: Scene, settings: ScannerSettings, extent: Extent, truth: Path, key: str) -> _TileTruth:
-    """Write the models that a tile owns."""
+def _tile_truth(scene: Scene, settings: ScannerSettings, extent: Extent | None, truth: Path, key: str) -> _TileTruth:
+    """Write the models that a tile owns, in one part; those of a whole scene in parts of `_BUILDINGS_PER_PART`."""
     whole = survey_extent(scene)
-    owned = [building for building in scene.buildings if _owns(extent, whole, building.x, building.y)]
+    own = extent or whole
+    owned = [building for building in scene.buildings if _owns(own, whole, building.x, building.y)]
     middles = [box.corners.mean(axis=0) for box in scene.boxes]
+    step = max(1, len(owned)) if key else _BUILDINGS_PER_PART
+    rows = []
+    for first in range(0, max(1, len(owned)), step):  # a scene without buildings has one part
+        part = key or f"part{first // step:05d}"
+        rows += write_models(owned[first : first + step], scene, settings, truth, part)
     return _TileTruth(
-        rows=write_models(owned, scene, settings, truth, key),
-        trees=sum(_owns(extent, whole, tree.x, tree.y) for tree in scene.trees),
-        cars=sum(_owns(extent, whole, float(middle[0]), float(middle[1])) for middle in middles),
+        rows=rows,
+        trees=sum(_owns(own, whole, tree.x, tree.y) for tree in scene.trees),
+        cars=sum(_owns(own, whole, float(middle[0]), float(middle[1])) for middle in middles),
     )
 
 

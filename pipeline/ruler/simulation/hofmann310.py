@@ -33,7 +33,6 @@ from pipeline.ruler.simulation.scene import (
     Terrain,
     Tree,
     WetSpot,
-    place_building,
 )
 from pipeline.ruler.simulation.suburb import tree_at
 
@@ -108,7 +107,6 @@ def hofmann310(seed: int) -> Scene:
     return Scene(
         name="hofmann310",
         origin=(563_000.0, 5_931_000.0, 0.0),
-        crs="EPSG:25832+7837",
         extent=(0.0, 0.0, *size),
         terrain=terrain,
         buildings=tuple(buildings),
@@ -203,15 +201,7 @@ def _built(
     random: np.random.Generator,
 ) -> Building:
     """A building on its plot."""
-    building = place_building(
-        building_id,
-        plan.shape,
-        plan.dimensions,
-        at=(plot.x, plot.y),
-        azimuth_deg=plan.azimuth_deg,
-        eave_height_m=_eave_height_m(plan.dimensions, random),
-        terrain=terrain,
-    )
+    building = plan.built(building_id, plot, _eave_height_m(plan.dimensions, random), terrain)
     wet_spots = _wet_spots(building, random) if Defect.WET_SPOT in defects else ()
     return dataclasses.replace(building, defects=defects, wet_spots=wet_spots)
 

@@ -107,7 +107,6 @@ def low_buildings(seed: int) -> Scene:
     return Scene(
         name="low_buildings",
         origin=(568_000.0, 5_937_000.0, 0.0),
-        crs="EPSG:25832+7837",
         extent=(0.0, 0.0, *extent),
         terrain=terrain,
         buildings=tuple(buildings),

@@ -9,7 +9,7 @@ import numpy as np
 
 from pipeline.model import FloatArray
 from pipeline.ruler.simulation.roofs import ROOFS, RoofDimensions, RoofShape
-from pipeline.ruler.simulation.scene import turned
+from pipeline.ruler.simulation.scene import Building, Terrain, place_building, turned
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -19,7 +19,6 @@ class Plot:
     x: float
     """Easting of the middle of the building's main rectangle, scene frame."""
     y: float
-    """Northing of the same."""
     extent: tuple[float, float, float, float]
     """The plot: smallest x, smallest y, largest x, largest y."""
 
@@ -29,19 +28,28 @@ class PlannedBuilding:
     """A building before it has a place."""
 
     shape: RoofShape
-    """The parametric shape."""
     dimensions: RoofDimensions
-    """Its size."""
     azimuth_deg: float
     """Direction of the ridge, clockwise from north."""
     margin_m: float
-    """Free ground around it."""
 
     @property
     def bounds(self) -> tuple[FloatArray, FloatArray]:
         """Lowest and highest corner (2,) of the turned roof's box about the middle of the main rectangle."""
         plan = turned(ROOFS[self.shape](self.dimensions).vertices[:, :2], 0.0, 0.0, self.azimuth_deg)
         return plan.min(axis=0), plan.max(axis=0)
+
+    def built(self, building_id: str, plot: Plot, eave_height_m: float, terrain: Terrain) -> Building:
+        """The building on its plot."""
+        return place_building(
+            building_id,
+            self.shape,
+            self.dimensions,
+            at=(plot.x, plot.y),
+            azimuth_deg=self.azimuth_deg,
+            eave_height_m=eave_height_m,
+            terrain=terrain,
+        )
 
 
 def packed_plots(

@@ -15,6 +15,9 @@ import shapely
 from pipeline.model import FloatArray, Plane, RoofType
 from pipeline.ruler.simulation.roofs import ROOF_TYPES, ROOFS, FaceRings, RoofDimensions, RoofShape
 
+_STEP_M = 0.05
+"""Step of the central differences of the terrain."""
+
 
 class Defect(StrEnum):
     """A reason why a building is hard to reconstruct from its points."""
@@ -53,6 +56,16 @@ class Terrain:
         for amplitude, east, north, phase in self.waves:
             z = z + amplitude * np.sin(east * x + north * y + phase)
         return z
+
+    def at(self, x: float, y: float) -> float:
+        """Elevation of one place."""
+        return float(self.elevation(np.array([x]), np.array([y]))[0])
+
+    def slope_deg(self, x: float, y: float) -> float:
+        """Slope at a place, by central differences."""
+        east = self.elevation(np.array([x - _STEP_M, x + _STEP_M]), np.array([y, y]))
+        north = self.elevation(np.array([x, x]), np.array([y - _STEP_M, y + _STEP_M]))
+        return math.degrees(math.atan(math.hypot(float(np.diff(east)[0]), float(np.diff(north)[0])) / (2 * _STEP_M)))
 
 
 def undulating_terrain(
@@ -220,13 +233,11 @@ class Scene:
     """Name of the suite."""
     origin: tuple[float, float, float]
     """CRS coordinates of the scene frame's origin, whole metres."""
-    crs: str | None
-    """Any text that pyproj understands, such as `EPSG:25832+7837`; None without a CRS."""
     extent: tuple[float, float, float, float]
     """Scanned rectangle: smallest x, smallest y, largest x, largest y in the scene frame."""
     terrain: Terrain
     """The ground."""
-    buildings: tuple[Building, ...]
+    buildings: tuple[Building, ...] = ()
     """Hits and labels number them in this order."""
     trees: tuple[Tree, ...] = ()
     """Trees and shrubs."""
@@ -236,6 +247,8 @@ class Scene:
     """Extent of the whole survey, scene frame, if the scene is one tile of it: the strips are laid over it."""
     survey_faults: tuple[SurveyFault, ...] = ()
     """Errors of the survey."""
+    crs: str | None = "EPSG:25832+7837"
+    """Any text that pyproj understands; None without a CRS."""
 
 
 def turned(local: FloatArray, x: float, y: float, azimuth_deg: float) -> FloatArray:

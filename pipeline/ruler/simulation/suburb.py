@@ -69,7 +69,7 @@ def tree_at(
     x: float, y: float, radius_m: float, height_m: float, terrain: Terrain, free_path_share: float = 0.28
 ) -> Tree:
     """A tree of a total height, with a bare trunk over the lowest fifth (under 2 m: a shrub down to the ground)."""
-    ground = float(terrain.elevation(np.array([x]), np.array([y]))[0])
+    ground = terrain.at(x, y)
     base = 0.2 * height_m if height_m > 2.0 else 0.0
     half = (height_m - base) / 2
     return Tree(
@@ -86,7 +86,7 @@ def car_at(x: float, y: float, azimuth_deg: float, terrain: Terrain, random: np.
     """A parked car."""
     length, width, height = random.uniform(3.8, 4.9), random.uniform(1.7, 1.9), random.uniform(1.4, 1.7)
     corners = np.array([(-length, -width), (length, -width), (length, width), (-length, width)]) / 2
-    ground = float(terrain.elevation(np.array([x]), np.array([y]))[0])
+    ground = terrain.at(x, y)
     return Box(corners=turned(corners, x, y, azimuth_deg), top_z_m=ground + height)
 
 
@@ -134,7 +134,6 @@ def suburb(seed: int, size_m: tuple[float, float] = (200.0, 200.0), name: str = 
     return Scene(
         name=name,
         origin=(565_000.0, 5_934_000.0, 0.0),
-        crs="EPSG:25832+7837",
         extent=(0.0, 0.0, *size_m),
         terrain=terrain,
         buildings=tuple(buildings),

@@ -39,15 +39,12 @@ class Suite:
     name: str
     """As given on the command line."""
     summary: str
-    """One sentence."""
     make: Callable[[int, tuple[float, float]], Scene]
     """Scene from a seed and a size in metres."""
     scanner: ScannerSettings
-    """Default survey."""
     size_m: tuple[float, float]
     """Default extent east and north."""
-    seed: int
-    """Default seed."""
+    seed: int = 1
     is_sized: bool = True
     """False if the extent follows from the buildings; `size_m` is then an approximate result, not an input."""
     returns: Returns = Returns.ALL
@@ -81,7 +78,7 @@ def _cube(seed: int, size_m: tuple[float, float]) -> Scene:
         "cube", RoofShape.FLAT, size, at=(middle_x, middle_y), azimuth_deg=0.0, eave_height_m=10.0, terrain=terrain
     )
     return Scene(
-        name="cube", origin=(0.0, 0.0, 0.0), crs=None, extent=(0.0, 0.0, *size_m), terrain=terrain, buildings=(cube,)
+        name="cube", origin=(0.0, 0.0, 0.0), extent=(0.0, 0.0, *size_m), terrain=terrain, buildings=(cube,), crs=None
     )
 
 
@@ -150,7 +147,6 @@ def single_building(
     return Scene(
         name=str(shape),
         origin=(565_000.0, 5_934_000.0, 0.0),
-        crs="EPSG:25832+7837",
         extent=(0.0, 0.0, *size_m),
         terrain=terrain,
         buildings=(building,),
@@ -165,7 +161,6 @@ def _single_suite(shape: RoofShape) -> Suite:
         make=lambda seed, size_m: single_building(shape, seed, size_m),
         scanner=ScannerSettings(pulse_density_per_m2=4.0),
         size_m=(40.0, 40.0),
-        seed=1,
     )
 
 
@@ -200,7 +195,6 @@ SUITES: dict[str, Suite] = {
             make=_cube,
             scanner=_CUBE_SCANNER,
             size_m=(30.0, 30.0),
-            seed=1,
         ),
         Suite(
             name="hofmann310",
@@ -208,7 +202,6 @@ SUITES: dict[str, Suite] = {
             make=lambda seed, _: hofmann310(seed),
             scanner=HOFMANN_SCANNER,
             size_m=(700.0, 700.0),
-            seed=1,
             is_sized=False,
             returns=Returns.LAST,
         ),
@@ -218,7 +211,6 @@ SUITES: dict[str, Suite] = {
             make=lambda seed, _: sweep(seed),
             scanner=SWEEP_SCANNER,
             size_m=(300.0, 250.0),
-            seed=1,
             is_sized=False,
             cells=CELLS,
         ),
@@ -228,7 +220,6 @@ SUITES: dict[str, Suite] = {
             make=city,
             scanner=CITY_SCANNER,
             size_m=(1000.0, 1000.0),
-            seed=1,
             part=lambda seed, size_m, settings: CityPlan(seed, size_m, settings).part,
             tile_m=TILE_M,
             on_slope=_city_on_slope,
@@ -239,7 +230,6 @@ SUITES: dict[str, Suite] = {
             make=lambda seed, _: low_buildings(seed),
             scanner=LOW_SCANNER,
             size_m=(100.0, 300.0),
-            seed=1,
             is_sized=False,
             cells=LOW_CELLS,
         ),
@@ -249,7 +239,6 @@ SUITES: dict[str, Suite] = {
             make=lambda seed, _: bridges_and_vans(seed),
             scanner=STREET_SCANNER,
             size_m=(168.0, 200.0),
-            seed=1,
             is_sized=False,
         ),
         Suite(
@@ -258,7 +247,6 @@ SUITES: dict[str, Suite] = {
             make=lambda seed, _: wide_halls(seed),
             scanner=HALL_SCANNER,
             size_m=(HALLS_SIZE_M, HALLS_SIZE_M),
-            seed=1,
             is_sized=False,
         ),
         Suite(
@@ -267,7 +255,6 @@ SUITES: dict[str, Suite] = {
             make=lambda seed, _: trust(seed, TRUST_CELLS[0].key),
             scanner=TRUST_SCANNER,
             size_m=(80.0, 80.0),
-            seed=1,
             is_sized=False,
             cells=TRUST_CELLS,
             make_for=trust,

@@ -39,11 +39,8 @@ class TileFiles:
     """One LAZ file and its labels."""
 
     laz: Path
-    """The points."""
     labels: Path
-    """Their truth, row by row."""
     points: int
-    """Returns in the file."""
     bounds: tuple[float, float, float, float]
     """Bounds of the points, CRS coordinates: smallest x, smallest y, largest x, largest y; nan without points."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Mapping
 
 import numpy as np
 import shapely
@@ -40,7 +41,7 @@ def cell_name(density_per_m2: float, noise_m: float) -> str:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Cell:
-    """One survey of a suite of several."""
+    """One survey of a suite of several, over the scene of all or over one of its own."""
 
     density_per_m2: float
     """Pulses per square metre of one strip."""
@@ -50,15 +51,28 @@ class Cell:
     """The returns of a pulse that the instrument records."""
     with_classes: bool = False
     """Whether the points have their true classes."""
+    strip_step_m: float = 0.0
+    """By how much every second strip is too high."""
+    kind: str = ""
+    """The kind of its own scene; empty if all cells survey one scene."""
+    settings: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    """Further settings of the scanner that differ from those of the suite."""
+
+    @property
+    def survey(self) -> str:
+        """Density and returns, in words of a folder."""
+        step = f"_z{self.strip_step_m:g}" if self.strip_step_m else ""
+        return f"d{self.density_per_m2:g}_{self.returns}{step}"
 
     @property
     def key(self) -> str:
         """Name of its folder."""
-        return cell_name(self.density_per_m2, self.noise_m)
+        return f"{self.kind}-{self.survey}" if self.kind else cell_name(self.density_per_m2, self.noise_m)
 
     def scanner(self, usual: ScannerSettings) -> ScannerSettings:
         """The survey, from the usual one of the suite."""
-        return dataclasses.replace(usual, pulse_density_per_m2=self.density_per_m2, range_noise_m=self.noise_m)
+        own = {"pulse_density_per_m2": self.density_per_m2, "range_noise_m": self.noise_m}
+        return dataclasses.replace(usual, **own, strip_step_m=self.strip_step_m, **self.settings)
 
 
 CELLS = tuple(Cell(density_per_m2=density, noise_m=noise) for density in DENSITIES_PER_M2 for noise in NOISES_M)
@@ -110,20 +124,12 @@ def sweep(seed: int) -> Scene:
                 f"sweep-row{number - len(defects)}", plot.x, plot.y, terrain
             )
             continue
-        building = place_building(
-            f"sweep-{number:03d}-{plan.shape}",
-            plan.shape,
-            plan.dimensions,
-            at=(plot.x, plot.y),
-            azimuth_deg=plan.azimuth_deg,
-            eave_height_m=2.9 * int(random.integers(1, 4)) + float(random.uniform(0.0, 0.6)),
-            terrain=terrain,
-        )
+        eave_m = 2.9 * int(random.integers(1, 4)) + float(random.uniform(0.0, 0.6))
+        building = plan.built(f"sweep-{number:03d}-{plan.shape}", plot, eave_m, terrain)
         buildings.append(dataclasses.replace(building, defects=defects[number]))
     return Scene(
         name="sweep",
         origin=(567_000.0, 5_936_000.0, 0.0),
-        crs="EPSG:25832+7837",
         extent=(0.0, 0.0, *extent),
         terrain=terrain,
         buildings=tuple(buildings),

@@ -51,7 +51,6 @@ def town(seed: int, size_m: tuple[float, float] = (400.0, 400.0), name: str = "t
     return Scene(
         name=name,
         origin=(566_000.0, 5_935_000.0, 0.0),
-        crs="EPSG:25832+7837",
         extent=(0.0, 0.0, *size_m),
         terrain=terrain,
         buildings=tuple(buildings),

@@ -35,54 +35,32 @@ DENSE_PER_M2 = 11.0
 SCANNER = ScannerSettings(altitude_m=700.0, strip_spacing_m=60.0, strip_overlap=0.3)
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Survey:
-    """Density, noise and returns of a survey."""
-
-    density_per_m2: float
-    """Pulses per square metre of one strip."""
-    noise_m: float
-    """Standard deviation along the beam."""
-    returns: Returns
-    """The returns of a pulse that are recorded."""
-    with_classes: bool = False
-    """Whether the points have their true classes."""
-    strip_step_m: float = 0.0
-    """By how much every second strip is too high."""
-
-    @property
-    def name(self) -> str:
-        """Density and returns, in words of a folder."""
-        step = f"_z{self.strip_step_m:g}" if self.strip_step_m else ""
-        return f"d{self.density_per_m2:g}_{self.returns}{step}"
-
-
 SURVEYS = (
-    Survey(density_per_m2=0.3, noise_m=0.05, returns=Returns.FIVE),
-    Survey(density_per_m2=0.8, noise_m=0.08, returns=Returns.LAST),
-    Survey(density_per_m2=1.8, noise_m=0.05, returns=Returns.FIRST),
-    Survey(density_per_m2=2.5, noise_m=0.08, returns=Returns.FIRST_AND_LAST, with_classes=True),
-    Survey(density_per_m2=4.0, noise_m=0.03, returns=Returns.FIVE),
-    Survey(density_per_m2=6.0, noise_m=0.05, returns=Returns.LAST, with_classes=True),
-    Survey(density_per_m2=10.0, noise_m=0.02, returns=Returns.FIRST),
-    Survey(density_per_m2=14.0, noise_m=0.03, returns=Returns.FIVE, with_classes=True),
-    Survey(density_per_m2=30.0, noise_m=0.02, returns=Returns.FIRST_AND_LAST),
+    Cell(density_per_m2=0.3, noise_m=0.05, returns=Returns.FIVE),
+    Cell(density_per_m2=0.8, noise_m=0.08, returns=Returns.LAST),
+    Cell(density_per_m2=1.8, noise_m=0.05, returns=Returns.FIRST),
+    Cell(density_per_m2=2.5, noise_m=0.08, returns=Returns.FIRST_AND_LAST, with_classes=True),
+    Cell(density_per_m2=4.0, noise_m=0.03, returns=Returns.FIVE),
+    Cell(density_per_m2=6.0, noise_m=0.05, returns=Returns.LAST, with_classes=True),
+    Cell(density_per_m2=10.0, noise_m=0.02, returns=Returns.FIRST),
+    Cell(density_per_m2=14.0, noise_m=0.03, returns=Returns.FIVE, with_classes=True),
+    Cell(density_per_m2=30.0, noise_m=0.02, returns=Returns.FIRST_AND_LAST),
 )
 SPARSE_SURVEYS = tuple(
-    Survey(density_per_m2=density, noise_m=noise, returns=returns, with_classes=density == 0.7)
+    Cell(density_per_m2=density, noise_m=noise, returns=returns, with_classes=density == 0.7)
     for density, noise in ((0.3, 0.05), (0.5, 0.1), (0.7, 0.05), (1.0, 0.03))
     for returns in (Returns.FIRST, Returns.FIVE)
 )
 STRIP_SURVEYS = tuple(
-    Survey(density_per_m2=density, noise_m=0.03, returns=returns, strip_step_m=step, with_classes=step == 0.6)
+    Cell(density_per_m2=density, noise_m=0.03, returns=returns, strip_step_m=step, with_classes=step == 0.6)
     for density, returns, steps in ((1.5, Returns.FIRST, (0.2, 0.45, 1.0)), (5.0, Returns.FIVE, (0.3, 0.6, 0.9, 1.5)))
     for step in steps
 )
 NOISY_SURVEYS = (
-    Survey(density_per_m2=1.5, noise_m=0.15, returns=Returns.FIRST),
-    Survey(density_per_m2=2.5, noise_m=0.2, returns=Returns.FIRST_AND_LAST),
-    Survey(density_per_m2=4.0, noise_m=0.15, returns=Returns.FIVE),
-    Survey(density_per_m2=10.0, noise_m=0.2, returns=Returns.LAST, with_classes=True),
+    Cell(density_per_m2=1.5, noise_m=0.15, returns=Returns.FIRST),
+    Cell(density_per_m2=2.5, noise_m=0.2, returns=Returns.FIRST_AND_LAST),
+    Cell(density_per_m2=4.0, noise_m=0.15, returns=Returns.FIVE),
+    Cell(density_per_m2=10.0, noise_m=0.2, returns=Returns.LAST, with_classes=True),
 )
 
 
@@ -92,8 +70,8 @@ class Kind:
 
     make: Callable[[np.random.Generator, float], Scene]
     """Scene from random numbers and about the width of it in metres."""
-    surveys: tuple[Survey, ...] = SURVEYS
-    """The surveys of its cells."""
+    surveys: tuple[Cell, ...] = SURVEYS
+    """Its cells, without their kind."""
     scanner: Mapping[str, float] = dataclasses.field(default_factory=dict)
     """Settings of the scanner that differ from `SCANNER`."""
 
@@ -123,38 +101,8 @@ KINDS: Mapping[str, Kind] = {
 """The kinds of scenes by name."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class TrustCell(Cell):
-    """A scene of one kind under one survey."""
-
-    kind: str
-    """Key of `KINDS`."""
-    survey: str
-    """Name of the survey."""
-    strip_step_m: float = 0.0
-    """By how much every second strip is too high."""
-
-    @property
-    def key(self) -> str:
-        """Name of its folder."""
-        return f"{self.kind}-{self.survey}"
-
-    def scanner(self, usual: ScannerSettings) -> ScannerSettings:
-        """The survey, from the usual one of the suite."""
-        changed = dataclasses.replace(super().scanner(usual), strip_step_m=self.strip_step_m)
-        return dataclasses.replace(changed, **KINDS[self.kind].scanner)
-
-
 CELLS = tuple(
-    TrustCell(
-        kind=name,
-        survey=survey.name,
-        density_per_m2=survey.density_per_m2,
-        noise_m=survey.noise_m,
-        returns=survey.returns,
-        with_classes=survey.with_classes,
-        strip_step_m=survey.strip_step_m,
-    )
+    dataclasses.replace(survey, kind=name, settings=kind.scanner)
     for name, kind in KINDS.items()
     for survey in kind.surveys
 )

@@ -25,7 +25,7 @@ from pipeline.ruler.simulation.scene import (
     turned,
     undulating_terrain,
 )
-from pipeline.ruler.simulation.trust_trees import CRS, ORIGIN, grown
+from pipeline.ruler.simulation.trust_trees import ORIGIN, grown
 
 _MARGIN_M = 4.0
 _EDGE_M = 6.0
@@ -47,25 +47,6 @@ def _terrain(random: np.random.Generator, slope_deg: float = 3.0) -> Terrain:
     return undulating_terrain(50.0, slope, aspect, 0.4, 90.0, random)
 
 
-def _scene(
-    extent: tuple[float, float, float, float],
-    terrain: Terrain,
-    buildings: Sequence[Building],
-    trees: Sequence[Tree] = (),
-    boxes: Sequence[Box] = (),
-) -> Scene:
-    return Scene(
-        name="houses",
-        origin=ORIGIN,
-        crs=CRS,
-        extent=extent,
-        terrain=terrain,
-        buildings=tuple(buildings),
-        trees=tuple(trees),
-        boxes=tuple(boxes),
-    )
-
-
 def _packed(sized: Sequence[tuple[RoofShape, RoofDimensions]], side_m: float, random: np.random.Generator) -> Scene:
     """Buildings on plots of their own, as wide as a scene or as the widest plot."""
     planned = [
@@ -75,19 +56,12 @@ def _packed(sized: Sequence[tuple[RoofShape, RoofDimensions]], side_m: float, ra
     widest = max(float(high[0] - low[0]) for low, high in (one.bounds for one in planned)) + 2 * _MARGIN_M
     plots, (east, north) = packed_plots(planned, max(side_m, math.ceil(widest)), 1)
     terrain = _terrain(random)
-    buildings = [
-        place_building(
-            f"house-{number:02d}-{plan.shape}",
-            plan.shape,
-            plan.dimensions,
-            at=(plot.x, plot.y),
-            azimuth_deg=plan.azimuth_deg,
-            eave_height_m=2.7 * int(random.integers(1, 4)) + float(random.uniform(0.0, 0.6)),
-            terrain=terrain,
-        )
-        for number, (plan, plot) in enumerate(zip(planned, plots, strict=True))
-    ]
-    return _scene((-_EDGE_M, -_EDGE_M, east + _EDGE_M, north + _EDGE_M), terrain, buildings)
+    buildings = []
+    for number, (plan, plot) in enumerate(zip(planned, plots, strict=True)):
+        eave_m = 2.7 * int(random.integers(1, 4)) + float(random.uniform(0.0, 0.6))
+        buildings.append(plan.built(f"house-{number:02d}-{plan.shape}", plot, eave_m, terrain))
+    extent = (-_EDGE_M, -_EDGE_M, east + _EDGE_M, north + _EDGE_M)
+    return Scene(name="houses", origin=ORIGIN, extent=extent, terrain=terrain, buildings=tuple(buildings))
 
 
 def houses(random: np.random.Generator, side_m: float) -> Scene:
@@ -188,7 +162,9 @@ def half_seen_in_shadow(random: np.random.Generator, side_m: float) -> Scene:
         towers, crowns = _in_front(house, side, terrain, random)
         buildings += [house, *towers]
         trees += crowns
-    return _scene((0.0, -_EDGE_M, 2 * _FLIGHT_M, rows * _ROW_M + _EDGE_M), terrain, buildings, trees)
+    extent = (0.0, -_EDGE_M, 2 * _FLIGHT_M, rows * _ROW_M + _EDGE_M)
+    scene = Scene(name="houses", origin=ORIGIN, extent=extent, terrain=terrain, buildings=tuple(buildings))
+    return dataclasses.replace(scene, trees=tuple(trees))
 
 
 def _in_front(
@@ -242,7 +218,8 @@ def terraces(random: np.random.Generator, side_m: float) -> Scene:
             upper = corners[[0, 3]]
             top = float(terrain.elevation(upper[:, 0], upper[:, 1]).mean())
             boxes.append(Box(corners=corners, top_z_m=top))
-    return _scene((0.0, 0.0, side_m, side_m), terrain, (), (), boxes)
+    extent = (0.0, 0.0, side_m, side_m)
+    return Scene(name="houses", origin=ORIGIN, extent=extent, terrain=terrain, boxes=tuple(boxes))
 
 
 def glass_houses(random: np.random.Generator, side_m: float) -> Scene:

@@ -14,7 +14,7 @@ from pipeline.ruler.simulation.suburb import tree_at
 
 Range = tuple[float, float]
 
-ORIGIN, CRS = (570_000.0, 5_939_000.0, 0.0), "EPSG:25832+7837"
+ORIGIN = (570_000.0, 5_939_000.0, 0.0)
 """Of all scenes of the suite."""
 _OUTSIDE_M = 6.0
 """Trees stand this far beyond the edge of the data, too."""
@@ -195,9 +195,7 @@ def stand(rule: StandRule, random: np.random.Generator, side_m: float) -> Scene:
     return Scene(
         name="trees",
         origin=ORIGIN,
-        crs=CRS,
         extent=(0.0, 0.0, side_m, side_m),
         terrain=terrain,
-        buildings=(),
         trees=tuple(trees),
     )

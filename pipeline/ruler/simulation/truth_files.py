@@ -10,17 +10,33 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import shapely
 
 import pipeline
 from pipeline.export.facts import RecordContext
 from pipeline.export.tile import write_tile
-from pipeline.ruler.simulation.conditions import condition_row
 from pipeline.ruler.simulation.scene import Building, Scene
 from pipeline.ruler.simulation.seeds import split_of
 from pipeline.ruler.simulation.solids import truth_record
 from pipeline.ruler.simulation.strips import ScannerSettings, reached, strip_shifts_m
 from pipeline.ruler.simulation.survey_files import TileFiles, spatial_reference
+
+CONDITIONS = pa.schema(
+    [
+        pa.field("building_id", pa.string(), nullable=False),
+        pa.field("shape", pa.string(), nullable=False),
+        pa.field("roof_type", pa.string(), nullable=False),
+        pa.field("good", pa.bool_(), nullable=False),
+        pa.field("defects", pa.list_(pa.string()), nullable=False),
+        pa.field("groups", pa.list_(pa.int32()), nullable=False),
+        pa.field("pitch_deg", pa.float64(), nullable=False),
+        pa.field("terrain_slope_deg", pa.float64(), nullable=False),
+        pa.field("touches_data_edge", pa.bool_(), nullable=False),
+    ]
+)
+"""One row per building. `groups` has the group number of the face of each plane_id."""
 
 
 def write_models(
@@ -41,9 +57,27 @@ def write_models(
     ]
     write_tile(truth, part, records, [], context, meshes="tile")
     return [
-        condition_row(building, scene.terrain, touches_data_edge=at_edge)
+        {
+            "building_id": building.building_id,
+            "shape": building.shape.value,
+            "roof_type": building.roof_type.value,
+            "good": building.is_good,
+            "defects": [str(defect) for defect in building.defects],
+            "groups": list(building.groups),
+            "pitch_deg": building.dimensions.pitch_deg,
+            "terrain_slope_deg": round(scene.terrain.slope_deg(building.x, building.y), 3),
+            "touches_data_edge": at_edge,
+        }
         for building, at_edge in zip(buildings, cut, strict=True)
     ]
+
+
+def write_conditions(rows: Iterable[dict[str, Any]], path: Path) -> None:
+    """Write the table, sorted by building_id; it appears under its name only when complete."""
+    table = pa.Table.from_pylist(sorted(rows, key=lambda row: str(row["building_id"])), schema=CONDITIONS)
+    part = path.with_name(f".{path.name}")
+    pq.write_table(table, part, compression="zstd")
+    part.replace(path)
 
 
 def _cut_by_the_end_of_the_data(buildings: Sequence[Building], scene: Scene, settings: ScannerSettings) -> list[bool]:

@@ -60,7 +60,6 @@ def wide_halls(seed: int) -> Scene:
     return Scene(
         name="wide_halls",
         origin=(570_000.0, 5_939_000.0, 0.0),
-        crs="EPSG:25832+7837",
         extent=(0.0, 0.0, SIZE_M, SIZE_M),
         terrain=terrain,
         buildings=(*buildings, *houses),

@@ -1,26 +1,28 @@
 /** The page: it shows what the address names. */
 
-import { currentKey, getJson, keepKey, Problem } from "./api/requests";
+import { currentKey, KEY_NEEDED, keepKey, Problem } from "./api/requests";
 import { JobList } from "./jobs/job_list";
 import { partsOf, placeOf } from "./page/address";
+import { openForm, type Opened } from "./page/dialogs";
 import { byId, el } from "./page/elements";
+import { field } from "./page/form_fields";
 import { problemNotice } from "./page/notices";
-import type { View } from "./page/view";
-import { welcome } from "./page/welcome";
+import { jobsChanged, type View } from "./page/view";
 import { showJob } from "./progress/job_view";
 import { Submission } from "./submit/submission";
 import { hasView, showView } from "./views";
 import "./frame.css";
 
 const main = byId("main");
-const jobs = new JobList(byId("jobs"), onProblem);
-new Submission(byId("submission"), (jobId) => {
-  void jobs.refresh();
+const jobs = new JobList(byId("jobs"));
+const submitted = (jobId: string): void => {
+  jobsChanged();
   location.hash = `#/jobs/${jobId}`;
-}, onProblem);
+};
+// files are sent in a way of their own
+new Submission(byId("submission"), submitted, (problem) => problem.status === 401 && askForKey(problem));
 
 let shown = "";
-let leave: () => void = () => undefined;
 let view: View | null = null;
 
 function route(): void {
@@ -35,77 +37,49 @@ function route(): void {
     if (isHere) link.setAttribute("aria-current", "page");
     else link.removeAttribute("aria-current");
   }
-  // only the building or the query changed: the view handles that itself
   const now = place !== null ? `${place.job} ${place.method ?? ""}` : isView ? `/${[address.name, ...address.rest].join("/")}` : "";
-  if (now === shown && place !== null) return;
   if (now === shown && view !== null) {
-    view.follow(address);
+    view.follow(address); // only the building or the query changed
     return;
   }
-  leave();
+  view?.leave();
   shown = now;
   view = null;
   main.scrollTop = 0;
-  const hooks = { onChange: () => void jobs.refresh(), onProblem };
   if (place !== null) {
-    leave = showJob(main, place, hooks);
+    view = showJob(main, place);
   } else if (isView) {
-    view = showView(main, address, hooks);
-    leave = view.leave;
+    view = showView(main, address);
   } else {
     document.title = "gablework";
-    main.replaceChildren(welcome());
-    leave = () => undefined;
+    main.replaceChildren(byId<HTMLTemplateElement>("welcome").content.cloneNode(true));
   }
 }
 
-/** Ask for a key that is missing or refused; show all other problems where they happened. */
-function onProblem(problem: Problem): void {
-  if (problem.status === 401) askForKey(problem);
-}
+let asking: Opened | null = null;
 
-const dialog = byId<HTMLDialogElement>("key-dialog");
-
+/** Ask for a key that is missing or refused. */
 function askForKey(problem: Problem | null): void {
-  if (dialog.open) return;
+  if (asking?.element.isConnected === true) return;
   if (problem !== null && currentKey() !== null) {
     problem = new Problem(problem.status, "This key is not valid", "It may be mistyped or revoked.", problem.remedy);
   }
-  const field = el("input", {
-    id: "key-field",
-    type: "password",
-    autocomplete: "off",
-    spellcheck: "false",
-    "aria-describedby": "key-hint",
+  const key = el("input", { id: "key-field", type: "password", autocomplete: "off", spellcheck: "false" });
+  key.value = currentKey() ?? "";
+  asking = openForm("Key of this service", {
+    content: [
+      problem === null ? null : problemNotice(problem),
+      field("Your key", key, "It begins with gw_. This tab forgets it when you close it."),
+    ],
+    send: "Use this key",
+    act: async () => {
+      keepKey(key.value);
+      location.reload();
+    },
   });
-  field.value = currentKey() ?? "";
-  const form = el(
-    "form",
-    { method: "dialog" },
-    el("h2", { id: "key-title" }, "Key of this service"),
-    problem === null ? null : problemNotice(problem),
-    el("label", { for: "key-field" }, "Your key"),
-    field,
-    el("p", { class: "hint", id: "key-hint" }, "It begins with gw_. This tab forgets it when you close it."),
-    el(
-      "div",
-      { class: "actions" },
-      el("button", { type: "button", class: "quiet", onclick: () => dialog.close() }, "Cancel"),
-      el("button", { type: "submit", class: "primary" }, "Use this key"),
-    ),
-  );
-  form.addEventListener("submit", () => {
-    keepKey(field.value);
-    location.reload();
-  });
-  dialog.replaceChildren(form);
-  dialog.showModal();
 }
 
 byId("key-button").addEventListener("click", () => askForKey(null));
+document.addEventListener(KEY_NEEDED, ({ detail }) => askForKey(detail));
 window.addEventListener("hashchange", route);
 route();
-void jobs.start();
-void getJson("processes/reconstruct").catch((error: unknown) => {
-  if (error instanceof Problem) onProblem(error);
-});

@@ -4,7 +4,7 @@ import { unreachable } from "./api/requests";
 import type { Address } from "./page/address";
 import { el } from "./page/elements";
 import { problemNotice } from "./page/notices";
-import type { Hooks, Show, View } from "./page/view";
+import type { Show, View } from "./page/view";
 
 const VIEWS: Record<string, () => Promise<Show>> = {
   jobs: async () => (await import("./jobs/history")).showHistory,
@@ -16,7 +16,7 @@ const VIEWS: Record<string, () => Promise<Show>> = {
 export const hasView = (name: string): boolean => Object.hasOwn(VIEWS, name);
 
 /** Load and show a view. */
-export function showView(place: HTMLElement, address: Address, hooks: Hooks): View {
+export function showView(place: HTMLElement, address: Address): View {
   let shown: View | null = null;
   let now = address;
   let isLeft = false;
@@ -24,7 +24,9 @@ export function showView(place: HTMLElement, address: Address, hooks: Hooks): Vi
     place.replaceChildren(el("p", { class: "loading" }, "Loading…"));
     VIEWS[address.name]?.().then(
       (show) => {
-        if (!isLeft) shown = show(place, now, hooks);
+        if (isLeft) return;
+        shown = show(place, now);
+        shown.follow(now);
       },
       () => {
         // the file of the view was not sent

@@ -2,7 +2,7 @@ import { expect, test } from "vitest";
 import { Batcher, SURFACE, type Batch } from "../src/models/batching";
 import { SequenceReader, type Building } from "../src/models/cityjson";
 import { classesOf, coloursOf, CYCLE, outlineColour, type Colouring } from "../src/models/colouring";
-import { bytesOf, CATEGORIES } from "../src/words/roof_types";
+import { CATEGORIES } from "../src/words/roof_types";
 import { GABLE, METADATA } from "./gable";
 
 /** The house with other attributes. */
@@ -27,8 +27,8 @@ function batched(): { batches: Batch[]; listed: ReturnType<Batcher["add"]>[] } {
 
 /** sRGB bytes to the bytes of linear light that the models have. */
 function linear(colour: string): number[] {
-  return bytesOf(colour).map((byte) => {
-    const share = byte / 255;
+  return [1, 3, 5].map((at) => {
+    const share = Number.parseInt(colour.slice(at, at + 2), 16) / 255;
     return Math.round(255 * (share <= 0.04045 ? share / 12.92 : ((share + 0.055) / 1.055) ** 2.4));
   });
 }
@@ -103,4 +103,16 @@ test("a chimney does not turn a roof red: its few points leave the class, howeve
   const { listed } = batched();
   expect(listed[0].figures.residual).toBe(1.2);
   expect(classesOf("residual", listed.slice(0, 1))[0].colour).toBe("#0072b2");
+});
+
+test("single buildings have a colour of their own, the others that of their type", () => {
+  const { batches } = batched();
+  const batch = batches.find(({ ids }) => ids.includes("b")) as Batch;
+  const colours = coloursOf(batch, (id) => (id === "b" ? "#ff0080" : null));
+  const roofs = batch.ids.map((_, n) => {
+    const corner = [...batch.surfaces].findIndex((surface, at) => at >= batch.starts[n] && surface >= 0);
+    return [...colours.subarray(4 * corner, 4 * corner + 4)];
+  });
+  const own = [...linear(CATEGORIES[batch.category].colour), 255];
+  expect(roofs).toEqual(batch.ids.map((id) => (id === "b" ? [255, 0, 55, 255] : own)));
 });

@@ -1,9 +1,8 @@
 import { expect, test } from "vitest";
 import type { Decision } from "../src/api/types";
 import { pointColour, tickStep } from "../src/dossier/dossier_drawings";
-import { cutModel, histogram, modelOf, roofEdges, sectionOf, strip, stripWidth, type Points } from "../src/dossier/dossier_geometry";
+import { cutModel, histogram, modelOf, pointsIn, roofEdges, sectionOf, strip, stripWidth, type Points } from "../src/dossier/dossier_geometry";
 import { dossierAddress, isDossier } from "../src/dossier/dossier_link";
-import { pointsIn } from "../src/dossier/dossier_points";
 import { checkRows, formRows, trust, trustFigures, withinWords } from "../src/dossier/dossier_words";
 import { SequenceReader } from "../src/models/cityjson";
 import { placeOf } from "../src/page/address";
@@ -172,12 +171,12 @@ test("the figures of fit name the points that they are of: older runs did not le
 test("figures are shown beside their limits, forms with their outcome", () => {
   expect(checkRows(DECISIONS)).toEqual([{ label: "Roof points", value: "412 points", limit: "from 10 points", words: "enough for a model" }]);
   const rows = formRows(DECISIONS, { rmse_m: 0.053 });
-  expect(rows.map(({ form, outcome }) => [form, outcome])).toEqual([
+  expect(rows.map(({ cells }) => [cells["Form"], cells["Outcome"]])).toEqual([
     ["Arrangement of the planes' lines", "not a valid solid"],
     ["Traced faces", "chosen"],
     ["LoD1.2", "made"],
   ]);
-  expect([rows[0].detail, rows[0].rmse, rows[1].rmse]).toEqual(["codes 306", "–", "0.053\u202fm"]);
+  expect([rows[0].cells["Notes"], rows[0].cells["RMSE"], rows[1].cells["RMSE"]]).toEqual(["codes 306", "–", "0.053\u202fm"]);
 });
 
 test("a doubtful model says why, with the figure and the threshold, and which side of the limit is right", () => {

@@ -1,6 +1,7 @@
 import { describe, expect, it } from "vitest";
 import type { Feature } from "../src/api/types";
-import { georeference, mercatorOf, pairsOf, type Xy } from "../src/map/georeference";
+import { georeference, mercatorOf, pairsOf } from "../src/map/georeference";
+import type { Point as Xy } from "../src/models/plan";
 
 const EARTH_M = 6_378_137;
 

@@ -1,3 +1,4 @@
+import { Ray, Vector3 } from "three";
 import { expect, test } from "vitest";
 import { groundDistance, groundOf, groundThrough, heightAt } from "../src/scene/ground";
 
@@ -23,15 +24,15 @@ test("between and beyond the floors the ground stays between them", () => {
 
 test("a ray meets the ground where it falls below it, and none above it or beside it", () => {
   const ground = groundThrough([0, 0, 0, 100, 0, 50, 0, 50, 0, 100, 50, 50], [0, 0, 100, 50], 100);
-  const down = [0, 0, -1] as const;
-  expect(groundDistance(ground, [70, 20, 200], down)).toBeCloseTo(200 - heightAt(ground, 70, 20), 5);
-  const level = groundDistance(ground, [1, 25, 30], [1, 0, 0]);
-  expect(level).not.toBeNull();
-  expect(heightAt(ground, 1 + (level as number), 25)).toBeCloseTo(30, 4);
-  expect(groundDistance(ground, [1, 25, 30], [-1, 0, 0])).toBeNull();
-  expect(groundDistance(ground, [1, 25, 60], [1, 0, 0])).toBeNull();
-  expect(groundDistance(ground, [200, 25, 60], down)).toBeNull();
-  expect(groundDistance(groundThrough([50, 20, 7], BOX, 32), [50, 20, 17], down)).toBeCloseTo(10, 5);
+  const down = new Vector3(0, 0, -1);
+  const from = (x: number, y: number, z: number, direction: Vector3): Ray => new Ray(new Vector3(x, y, z), direction);
+  expect(groundDistance(ground, from(70, 20, 200, down))).toBeCloseTo(200 - heightAt(ground, 70, 20), 5);
+  const level = groundDistance(ground, from(1, 25, 30, new Vector3(1, 0, 0)));
+  expect(heightAt(ground, 1 + level, 25)).toBeCloseTo(30, 4);
+  expect(groundDistance(ground, from(1, 25, 30, new Vector3(-1, 0, 0)))).toBe(Infinity);
+  expect(groundDistance(ground, from(1, 25, 60, new Vector3(1, 0, 0)))).toBe(Infinity);
+  expect(groundDistance(ground, from(200, 25, 60, down))).toBe(Infinity);
+  expect(groundDistance(groundThrough([50, 20, 7], BOX, 32), from(50, 20, 17, down))).toBeCloseTo(10, 5);
 });
 
 test("the terrain of a run lies about the scene's origin, and unknown nodes lie between known ones", () => {

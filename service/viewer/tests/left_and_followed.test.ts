@@ -5,7 +5,7 @@ import { afterEach, beforeEach, describe, expect, test, vi } from "vitest";
 import type { StatusInfo } from "../src/api/types";
 import { showChanges } from "../src/changes/changes_view";
 import type { Listed } from "../src/models/batching";
-import type { FromLoading } from "../src/models/loading_messages";
+import type { FromLoading } from "../src/models/model_loading";
 import { hashOf, partsOf } from "../src/page/address";
 import { showResults } from "../src/results/results_view";
 import type { Ground } from "../src/scene/ground";
@@ -29,17 +29,15 @@ vi.mock("../src/scene/scene", () => ({
     select(id: string | null, fly: boolean): void {
       this.selections.push([id, fly]);
     }
-    has = (): boolean => true;
+    readonly models = { has: (): boolean => true, showOnly: (): void => undefined, colourBy: (): void => undefined };
     groundAt = (): number => 0;
     terrain: Ground | null = null;
-    layTerrain(terrain: Ground): void {
+    lay(terrain: Ground): void {
       this.terrain = terrain;
     }
     add(): void {}
     finish(): void {}
-    showOnly(): void {}
-    tint(): void {}
-    watchCamera(): void {}
+    readonly camera = { watch: (): void => undefined, look: (): void => undefined };
     dispose(): void {}
   },
 }));
@@ -52,7 +50,7 @@ vi.mock("../src/models/rejected_objects", async (original) => {
   const { request } = await import("../src/api/requests");
   return {
     ...(await original<object>()),
-    rejectedObjects: async (path: string) => (await request(`${path}/results/rejected`)).json(),
+    rejectedObjects: async (run: { jobPath: string }) => (await request(`${run.jobPath}/results/rejected`)).json(),
   };
 });
 
@@ -65,7 +63,6 @@ const buildings = (...objects: Listed[]): FromLoading => ({
   outlines: { ids: [], categories: [], shapeStarts: new Uint32Array(1), ringStarts: new Uint32Array(1), xy: new Float32Array() },
 });
 
-const hooks = { onChange: vi.fn(), onProblem: vi.fn() };
 let service: FakeService;
 let place: HTMLElement;
 let leave: () => void = () => undefined;
@@ -110,7 +107,7 @@ describe("the results of a job", () => {
 
   async function open(building: string | null, query = ""): Promise<void> {
     await go(`#/jobs/1${building === null ? "" : `/buildings/${building}`}${query}`);
-    leave = showResults(place, JOB, { job: "1", method: null, building }, hooks);
+    leave = showResults(place, JOB, { job: "1", method: null, building });
     await settled();
   }
 
@@ -223,20 +220,21 @@ describe("two runs side by side", () => {
   test("are not reported as a fault when others are chosen while they load", async () => {
     const held = service.hold("GET jobs/1/results/report");
     location.hash = two;
-    const view = showChanges(place, partsOf(two), hooks);
+    const view = showChanges(place);
+    view.follow(partsOf(two));
     leave = () => view.leave();
     await settled();
     view.follow(partsOf(hashOf(["changes"], { old: "2", new: "3" })));
     held.give({ body: {} });
     await settled();
     expect(place.querySelector("[role=alert]")).toBeNull();
-    expect(hooks.onProblem).not.toHaveBeenCalled();
     expect(place.querySelectorAll("canvas[data-ready]")).toHaveLength(2);
   });
 
   test("fly to a building of the list after a click on the chosen model", async () => {
     location.hash = two;
-    const view = showChanges(place, partsOf(two), hooks);
+    const view = showChanges(place);
+    view.follow(partsOf(two));
     leave = () => view.leave();
     await settled();
     const follow = (): void => view.follow(partsOf(location.hash));

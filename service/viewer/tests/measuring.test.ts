@@ -1,27 +1,20 @@
+import { Vector3 } from "three";
 import { expect, test } from "vitest";
-import { inWords, measured } from "../src/tools/measuring";
+import { measured } from "../src/tools/measure_tool";
 
-test("the slope distance is the hypotenuse of plan and height", () => {
-  expect(measured([1, 2, 10], [4, 6, 22])).toEqual({
-    horizontalM: 5,
-    heightM: 12,
-    slopeM: 13,
-    slopeDeg: (Math.atan2(12, 5) * 180) / Math.PI,
-  });
+const figures = (from: number[], to: number[]): string[] => measured(new Vector3(...from), new Vector3(...to)).map(([, figure]) => figure.replaceAll("\u202f", " "));
+
+test("the slope distance is the hypotenuse of plan and height, and the height has a sign", () => {
+  expect(figures([1, 2, 10], [4, 6, 22])).toEqual(["5.00 m", "+12.00 m", "13.00 m", "67.4 °"]);
+  expect(figures([0, 0, 0], [3, 4, 1.5])).toEqual(["5.00 m", "+1.50 m", "5.22 m", "16.7 °"]);
 });
 
 test("measuring back gives the same distances and the opposite height", () => {
-  const [there, back] = [measured([0, 0, 0], [3, -4, 2.5]), measured([3, -4, 2.5], [0, 0, 0])];
-  expect(back).toEqual({ ...there, heightM: -2.5, slopeDeg: -there.slopeDeg });
+  expect(figures([0, 0, 0], [3, -4, 2.5])).toEqual(["5.00 m", "+2.50 m", "5.59 m", "26.6 °"]);
+  expect(figures([3, -4, 2.5], [0, 0, 0])).toEqual(["5.00 m", "−2.50 m", "5.59 m", "−26.6 °"]);
 });
 
-test("figures are in metres with a sign for the height", () => {
-  expect(inWords(measured([0, 0, 0], [3, 4, 1.5]))).toEqual([
-    ["Horizontal distance", "5.00\u202fm"],
-    ["Height difference", "+1.50\u202fm"],
-    ["Slope distance", "5.22\u202fm"],
-    ["Inclination", "16.7\u202f°"],
-  ]);
-  expect(inWords(measured([0, 0, 9], [3, 4, 9]))[1][1]).toBe("0.00\u202fm");
-  expect(inWords(measured([0, 0, 9], [0, 0, 1]))[1][1]).toBe("−8.00\u202fm");
+test("a level line and one without a plan have their figures, too", () => {
+  expect(figures([0, 0, 9], [3, 4, 9])).toEqual(["5.00 m", "0.00 m", "5.00 m", "0.0 °"]);
+  expect(figures([0, 0, 9], [0, 0, 1])).toEqual(["0.00 m", "−8.00 m", "8.00 m", "−90.0 °"]);
 });

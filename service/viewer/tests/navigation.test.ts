@@ -14,7 +14,7 @@ const surfaces: Surfaces = {
   bounds: new Box3(new Vector3(-400, -400, 0), new Vector3(400, 400, 260)),
   meet(ray) {
     const tower = ray.intersectBox(TOWER, new Vector3())?.distanceTo(ray.origin) ?? Infinity;
-    const ground = groundDistance(GROUND, ray.origin.toArray(), ray.direction.toArray()) ?? Infinity;
+    const ground = groundDistance(GROUND, ray);
     const distance = Math.min(ground, tower);
     return Number.isFinite(distance) ? { distance, isGround: ground < tower } : null;
   },

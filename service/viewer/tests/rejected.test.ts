@@ -1,7 +1,7 @@
 // @vitest-environment happy-dom
 import { describe, expect, test } from "vitest";
 import { listedRejected, readRejected } from "../src/models/rejected_objects";
-import { rejectedRecord } from "../src/results/rejected_record";
+import { rejectedRecord } from "../src/results/record";
 
 /** Parquet written by pyarrow: two objects, one without a confidence. */
 const TABLE =

@@ -1,6 +1,6 @@
 import { describe, expect, it } from "vitest";
-import { ringsOf } from "../src/models/rings";
-import { grown, pathOf } from "../src/progress/so_far";
+import { boxAround, ringsOf, united } from "../src/models/plan";
+import { pathOf } from "../src/progress/so_far";
 
 const square = [
   [10, 20],
@@ -22,8 +22,8 @@ describe("outlines of buildings so far", () => {
   });
 
   it("grows its bounds with each building", () => {
-    expect(grown(null, [])).toBeNull();
-    expect(grown(null, [[...square]])).toEqual([10, 20, 14, 25]);
-    expect(grown([0, 22, 12, 23], [[...square]])).toEqual([0, 20, 14, 25]);
+    expect(boxAround(square)).toEqual([10, 20, 14, 25]);
+    expect(united([[0, 22, 12, 23], boxAround(square)])).toEqual([0, 20, 14, 25]);
+    expect(united([boxAround([]), [0, 22, 12, 23]])).toEqual([0, 22, 12, 23]);
   });
 });

@@ -28,7 +28,7 @@ describe("a record", () => {
     const feature = { type: "Feature", id: "a", geometry: null, properties };
     vi.stubGlobal("fetch", vi.fn(async () => Response.json(feature)));
     const place = document.createElement("div");
-    const stop = showRecord(place, "/jobs/1", null, "a", FOOT_M, () => undefined);
+    const stop = showRecord(place, { jobPath: "jobs/1", method: null }, "a", FOOT_M);
     await vi.waitFor(() => expect(place.textContent).toContain("Ridge above floor"));
     stop();
     const text = place.textContent.replace(/\u202f/g, " ");

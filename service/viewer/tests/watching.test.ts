@@ -2,11 +2,11 @@
 import { afterEach, beforeEach, expect, test, vi } from "vitest";
 import { showHistory } from "../src/jobs/history";
 import { partsOf } from "../src/page/address";
+import type { Show, View } from "../src/page/view";
 import { showSchedules } from "../src/service/schedules_view";
 import { showWebhooks } from "../src/service/webhooks_view";
 import { FakeService, press, settled } from "./fake_service";
 
-const hooks = { onChange: vi.fn(), onProblem: vi.fn() };
 let service: FakeService;
 let place: HTMLElement;
 
@@ -21,6 +21,12 @@ afterEach(() => {
   vi.useRealTimers();
   vi.unstubAllGlobals();
 });
+
+function opened(show: Show, hash: string): View {
+  const view = show(place, partsOf(hash));
+  view.follow(partsOf(hash));
+  return view;
+}
 
 const SCHEDULE = { scheduleID: "s", title: "nightly", cron: "0 2 * * *", timeZone: "UTC", state: "active", processID: "echo", nextTimes: [], counts: {}, version: 1 };
 const JOBS = "GET jobs?limit=25&offset=0";
@@ -45,7 +51,7 @@ const VIEWS = [
     action: "PATCH schedules/s",
     open: () => {
       service.on("GET schedules?limit=25&offset=0", { schedules: [SCHEDULE], links: [] });
-      return showSchedules(place, partsOf("#/schedules"), hooks);
+      return opened(showSchedules, "#/schedules");
     },
     act: () => choose("nightly", "Pause"),
   },
@@ -56,7 +62,7 @@ const VIEWS = [
     open: () => {
       service.on("GET schedules/s", SCHEDULE);
       service.on("GET schedules/s/runs?limit=25&offset=0", { runs: [], links: [] });
-      return showSchedules(place, partsOf("#/schedules/s"), hooks);
+      return opened(showSchedules, "#/schedules/s");
     },
     act: () => choose("nightly", "Pause"),
   },
@@ -66,7 +72,7 @@ const VIEWS = [
     action: "PATCH jobs/1",
     open: () => {
       service.on(JOBS, RUNNING);
-      return showHistory(place, partsOf("#/jobs"), hooks);
+      return opened(showHistory, "#/jobs");
     },
     act: () => choose("a town", "Keep it"),
   },
@@ -77,7 +83,7 @@ const VIEWS = [
     open: () => {
       service.on(LOG, { deliveries: [DELIVERY], links: [] });
       service.on(RECEIVERS, { webhooks: [RECEIVER], eventTypes: [] });
-      return showWebhooks(place, partsOf("#/webhooks"), hooks);
+      return opened(showWebhooks, "#/webhooks");
     },
     act: () => choose("ours", "Send what it missed"),
   },
@@ -87,7 +93,7 @@ const VIEWS = [
     action: "POST webhooks/deliveries/d/replay",
     open: () => {
       service.on("GET webhooks/deliveries/d", DELIVERY);
-      return showWebhooks(place, partsOf("#/webhooks/deliveries/d"), hooks);
+      return opened(showWebhooks, "#/webhooks/deliveries/d");
     },
     act: () => press("Send again"),
   },
@@ -113,7 +119,7 @@ for (const { name, reads, action, open, act } of VIEWS) {
 test("a list with a job under way is read again while the service is away, and its notice stays one", async () => {
   vi.useFakeTimers();
   service.on(JOBS, RUNNING);
-  const view = showHistory(place, partsOf("#/jobs"), hooks);
+  const view = opened(showHistory, "#/jobs");
   await vi.advanceTimersByTimeAsync(1000);
   expect(place.querySelectorAll("tbody tr")).toHaveLength(1);
   vi.stubGlobal("fetch", () => Promise.reject(new TypeError("no network")));
@@ -135,7 +141,7 @@ test("a list with a job under way is read again while the service is away, and i
 test("a view that was left is not read again by the clock", async () => {
   vi.useFakeTimers();
   service.on(JOBS, RUNNING);
-  const view = showHistory(place, partsOf("#/jobs"), hooks);
+  const view = opened(showHistory, "#/jobs");
   await vi.advanceTimersByTimeAsync(4500);
   expect(service.count(JOBS)).toBe(2);
   view.leave();

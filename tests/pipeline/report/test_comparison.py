@@ -1,7 +1,6 @@
 """Runs side by side: one table, one page, nothing hidden, and views of one place at one scale."""
 
 import dataclasses
-import itertools
 import json
 import random
 import re
@@ -27,7 +26,6 @@ from pipeline.ruler.evaluation.reading import read_models
 from pipeline.ruler.report import comparison_page, comparison_points
 from pipeline.ruler.report.comparison import ComparedRun, PointFiles, write_comparison
 from pipeline.ruler.report.comparison_choice import CASES, DIFFERENT, Choice, chosen_buildings
-from pipeline.ruler.report.comparison_figures import seconds_text
 from pipeline.ruler.report.comparison_pictures import BLOCK_COLOUR, REACH_M, draw_building, place_of
 from pipeline.ruler.report.comparison_points import points_within
 from pipeline.ruler.report.comparison_records import ComparedBuilding, Record, differences
@@ -257,20 +255,6 @@ def test_points_of_buildings_are_those_within_their_areas_each_once(tmp_path: Pa
         assert xyz == pytest.approx(same * scale, abs=1e-6)
 
 
-def test_a_file_without_a_wanted_building_is_opened_but_not_read(
-    points: PointFiles, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    x, y, _ = small.ORIGIN
-    gable = shapely.box(x, y, x + 10.0, y + 8.0)
-    read = []
-    chunks = Source.chunks
-    monkeypatch.setattr(Source, "chunks", lambda source: read.append(source.info.path) or chunks(source))
-    assert [len(xyz) for xyz in points_within(points, [shapely.box(0.0, 0.0, 9.0, 9.0)])] == [0]
-    assert read == []
-    assert [len(xyz) for xyz in points_within(points, [gable])] == [20 * 16]
-    assert read == list(points.paths)
-
-
 def test_of_copc_a_window_a_building_is_read_and_gives_the_same_points(
     points: PointFiles, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -478,9 +462,3 @@ def test_what_is_written_does_not_depend_on_when_and_where(
     written = [write_comparison(tmp_path / name, runs, points=points) for name in ("one", "two")]
     for first, second in zip(*written, strict=True):
         assert first.read_bytes() == second.read_bytes()
-
-
-def test_seconds_grow_with_three_digits() -> None:
-    facts = [seconds_text(10.0**power) for power in range(-3, 5)]
-    assert facts == ["0.001 s", "0.010 s", "0.100 s", "1.00 s", "10.0 s", "100 s", "1,000 s", "10,000 s"]
-    assert all(a != b for a, b in itertools.pairwise(facts))

@@ -15,7 +15,6 @@ import pyarrow as pa
 import pytest
 import shapely
 from damaged_suburb import (
-    DEFINITIONS,
     KINDS,
     damaged,
     damaged_evaluation,
@@ -33,7 +32,7 @@ from roofs_by_hand import flat, reference
 from pipeline.report.maps import BAD, GOOD, MISSING, Map
 from pipeline.ruler.evaluation.chapters import printed
 from pipeline.ruler.evaluation.counts import visible_share
-from pipeline.ruler.evaluation.definitions import DEFINITIONS as ALL
+from pipeline.ruler.evaluation.definitions import DEFINITIONS
 from pipeline.ruler.evaluation.evaluate import Evaluation, evaluate
 from pipeline.ruler.evaluation.files import EvaluationRequest, evaluate_files
 from pipeline.ruler.evaluation.models import RoofModel, RoofSurface
@@ -55,7 +54,7 @@ def map_called(evaluation: Evaluation, title: str) -> Map:
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_page_holds_every_measure_of_every_kind_of_evaluation(kind: dict[str, bool]) -> None:
     evaluation = damaged_evaluation(**kind)
-    read = Reader(page(evaluation, DEFINITIONS))
+    read = Reader(page(evaluation))
     assert read.open == []
     texts = [text.strip() for text in read.texts]
     for one in evaluation.measures:
@@ -68,7 +67,7 @@ def test_the_page_holds_every_measure_of_every_kind_of_evaluation(kind: dict[str
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_page_is_one_file_without_scripts_that_loads_nothing(kind: dict[str, bool], tmp_path: Path) -> None:
-    path = write_page(damaged_evaluation(**kind), tmp_path, DEFINITIONS)
+    path = write_page(damaged_evaluation(**kind), tmp_path)
     assert [file.name for file in tmp_path.iterdir()] == ["report.html"]
     text = path.read_text()
     assert len(text) < 8_000_000
@@ -76,7 +75,7 @@ def test_the_page_is_one_file_without_scripts_that_loads_nothing(kind: dict[str,
 
 
 def test_pictures_say_in_words_what_they_show_and_ids_are_unique() -> None:
-    read = Reader(page(damaged_evaluation(), DEFINITIONS))
+    read = Reader(page(damaged_evaluation()))
     assert len(read.all("img")) >= 3 + 2 * 7
     for image in read.all("img"):
         assert base64.b64decode((image["src"] or "").partition(",")[2])[:4] == b"\x89PNG"
@@ -103,7 +102,6 @@ def test_names_from_outside_are_text_and_never_markup() -> None:
             tables={**evaluation.tables, "buildings": pa.Table.from_pylist(rows)},
             notes=(evil,),
         ),
-        DEFINITIONS,
     )
     assert "<script" not in text
     read = Reader(text)
@@ -113,8 +111,8 @@ def test_names_from_outside_are_text_and_never_markup() -> None:
 
 
 def test_the_figures_of_the_headline_exist_and_are_at_most_eight() -> None:
-    assert {name for names in HEADLINE for name in names} <= set(ALL)
-    shown = re.findall(r'<ul class="headline">(.*?)</ul>', page(damaged_evaluation(), DEFINITIONS), re.DOTALL)[0]
+    assert {name for names in HEADLINE for name in names} <= set(DEFINITIONS)
+    shown = re.findall(r'<ul class="headline">(.*?)</ul>', page(damaged_evaluation()), re.DOTALL)[0]
     assert 4 <= shown.count("<li>") <= 8
     assert html.escape("86.7 %") in shown
 
@@ -188,7 +186,7 @@ def test_without_points_or_a_reference_there_are_still_maps_but_no_invented_figu
     assert {entry.label: entry.count for entry in status.legend} == {"model": 12, "fallback (a block)": 2}
     assert worst_cases(alone) == []
     assert charts(alone.tables) == []
-    assert "Vertical distance" not in page(damaged_evaluation(points=False), DEFINITIONS)
+    assert "Vertical distance" not in page(damaged_evaluation(points=False))
 
 
 def row_of_flats(walls: Sequence[float], name: str) -> list[RoofModel]:
@@ -216,7 +214,7 @@ def test_a_row_has_the_colour_of_what_was_found(walls: tuple[float, ...], outcom
 
 
 def test_the_page_without_a_truth_has_figures_and_a_picture() -> None:
-    text = page(damaged_evaluation(reference=False), DEFINITIONS)
+    text = page(damaged_evaluation(reference=False))
     read = Reader(text)
     texts = [part.strip() for part in read.texts]
     for wanted in ("The models", "Roof types", "Over the models", "footprint, m2", "roof faces"):
@@ -226,7 +224,7 @@ def test_the_page_without_a_truth_has_figures_and_a_picture() -> None:
     assert "14 of 14 models" in (views[0]["alt"] or "")
     drawn = pixels(base64.b64decode((views[0]["src"] or "").partition(",")[2]))
     assert (drawn[:, :, 3] > 0).mean() > 0.05
-    with_truth = Reader(page(damaged_evaluation(), DEFINITIONS))
+    with_truth = Reader(page(damaged_evaluation()))
     assert not [image for image in with_truth.all("img") if (image["alt"] or "").startswith("Bird's-eye view. ")]
     assert "Over the models" in [part.strip() for part in with_truth.texts]
 
@@ -448,7 +446,7 @@ def test_a_perfect_evaluation_has_no_worst_case() -> None:
         tables={"buildings": pa.Table.from_pylist(rows)},
         notes=(),
     )
-    text = page(perfect, DEFINITIONS)
+    text = page(perfect)
     assert "Worst cases" not in text
     assert {entry.label for entry in map_called(perfect, "Buildings by outcome").legend} == {"correct"}
 
@@ -458,7 +456,7 @@ def test_a_perfect_evaluation_has_no_worst_case() -> None:
 def test_a_browser_shows_the_page_without_complaint_or_sideways_scrolling(width: int, tmp_path: Path) -> None:
     from playwright.sync_api import sync_playwright
 
-    path = write_page(damaged_evaluation(), tmp_path, DEFINITIONS)
+    path = write_page(damaged_evaluation(), tmp_path)
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=program("chromium"), args=["--no-sandbox"])
         shades = []

@@ -206,7 +206,7 @@ def test_a_comparison_shows_each_method_and_the_page_of_all(
 
     page.locator(".menu summary", has_text="Download").click()
     with page.expect_download() as download:
-        page.get_by_role("link", name="All methods, zip").click()
+        page.get_by_role("link", name="The whole comparison in a zip file").click()
     with zipfile.ZipFile(download.value.path()) as archive:
         assert {f"runs/{label}/run.json" for label in labels} <= set(archive.namelist())
 

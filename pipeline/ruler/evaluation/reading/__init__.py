@@ -28,7 +28,6 @@ class Reader:
     recognises: Callable[[Path], bool]
     """Whether a path has this format, by its name and content."""
     read: Callable[[Path], ModelSet]
-    """Reads a path."""
 
 
 def read_models(path: str | Path) -> ModelSet:

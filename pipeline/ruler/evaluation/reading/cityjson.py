@@ -47,23 +47,14 @@ class Frame:
     """(3,) float64."""
     translate: FloatArray
     """(3,) float64."""
-    units_m: FloatArray
-    """(3,) float64, metres per unit of easting, northing, elevation."""
-    templates: Sequence[Object]
-    """Geometries that instances place."""
-    template_vertices: FloatArray
-    """(t, 3) float64."""
+    empty: Places
+    """Templates and units, without vertices."""
 
     def places(self, vertices: Sequence[Sequence[float]]) -> Places:
         """Vertices of a file or feature in metres."""
         with np.errstate(over="ignore", invalid="ignore"):
-            metres = (_triples(vertices) * self.scale + self.translate) * self.units_m
-        return Places(
-            vertices=metres,
-            units_m=self.units_m,
-            templates=self.templates,
-            template_vertices=self.template_vertices,
-        )
+            metres = (_triples(vertices) * self.scale + self.translate) * self.empty.units_m
+        return dataclasses.replace(self.empty, vertices=metres)
 
 
 def is_cityjson(path: Path) -> bool:
@@ -195,9 +186,12 @@ def _frame(
         return Frame(
             scale=_triples([transform["scale"]])[0],
             translate=_triples([transform["translate"]])[0],
-            units_m=np.array([units_m[0], units_m[0], units_m[1]]),
-            templates=templates.get("templates", ()),
-            template_vertices=_triples(templates.get("vertices-templates", ())),
+            empty=Places(
+                vertices=np.empty((0, 3)),
+                units_m=np.array([units_m[0], units_m[0], units_m[1]]),
+                templates=templates.get("templates", ()),
+                template_vertices=_triples(templates.get("vertices-templates", ())),
+            ),
         )
     except _FAULTS as fault:
         raise _broken(path, where, fault) from fault

@@ -22,15 +22,12 @@ class Collected:
     models: list[RoofModel] = dataclasses.field(default_factory=list)
     """Those with a footprint and roof faces."""
     failed: list[RoofModel] = dataclasses.field(default_factory=list)
-    """The others."""
     notes: dict[str, None] = dataclasses.field(default_factory=dict)
-    """Sentences, each once."""
     counts: dict[str, int] = dataclasses.field(default_factory=dict)
     """Numbers by sentences with `{n}` in place of the number."""
     crs: str | None = None
     """Coordinate reference system of the first file that has one."""
     has_footprints: bool = False
-    """As in `ModelSet`."""
 
     def note(self, sentence: str) -> None:
         """Keep a sentence."""

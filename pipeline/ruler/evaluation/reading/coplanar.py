@@ -3,192 +3,137 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Sequence
+from itertools import chain, count, pairwise
+from typing import NamedTuple
 
-import numpy as np
-
-from pipeline.compiler import kernel
 from pipeline.kernels.normal_equations import solve_plane_moments
-from pipeline.kernels.sorting import ascending_order, counting_sort
-from pipeline.model import FloatArray, IntArray, LabelArray
 
 DISTANCE_M = 0.01
 """Vertices up to this far from a plane lie in it."""
 ANGLE_DEG = 0.1
 """Normals up to this angle apart are the same. A narrow face may differ more: as far as `DISTANCE_M` tilts it."""
 
+Point = Sequence[float]
+"""x, y, z in metres, about a nearby origin."""
+Rings = Sequence[Sequence[int]]
+"""Numbers of vertices: the outer ring first, holes the other way round."""
+
 _MIN_UP = 1e-9
 """Numerical guard: faces whose unit normals have a smaller z are vertical and stay apart."""
 
 
-@kernel
-def face_vectors(xyz: FloatArray, corners: IntArray, ring_offsets: IntArray, face_rings: IntArray) -> FloatArray:
-    """Area vectors of faces (Newell), (f, 3) m2: the direction is the normal, the length the area less the holes'.
-
-    Vertices `xyz` (v, 3) are in metres, about a nearby origin; `corners` (c,) are the vertices of all rings, one ring
-    after the other, which start at `ring_offsets` (r + 1,). Faces start in the rings at `face_rings` (f + 1,), the
-    outer ring first, holes the other way round.
-    """
-    vectors = np.zeros((len(face_rings) - 1, 3))
-    for f in range(len(vectors)):
-        for r in range(face_rings[f], face_rings[f + 1]):
-            p = corners[ring_offsets[r]] if ring_offsets[r] < ring_offsets[r + 1] else 0
-            for k in range(ring_offsets[r] + 1, ring_offsets[r + 1] - 1):
-                q, s = corners[k], corners[k + 1]
-                ux, uy, uz = xyz[q, 0] - xyz[p, 0], xyz[q, 1] - xyz[p, 1], xyz[q, 2] - xyz[p, 2]
-                vx, vy, vz = xyz[s, 0] - xyz[p, 0], xyz[s, 1] - xyz[p, 1], xyz[s, 2] - xyz[p, 2]
-                vectors[f, 0] += 0.5 * (uy * vz - uz * vy)
-                vectors[f, 1] += 0.5 * (uz * vx - ux * vz)
-                vectors[f, 2] += 0.5 * (ux * vy - uy * vx)
-    return vectors
+def area_vector(xyz: Sequence[Point], rings: Rings) -> tuple[float, float, float]:
+    """Area vector of a face (Newell), m2: the direction is the normal, the length the area less the holes'."""
+    x, y, z = 0.0, 0.0, 0.0
+    for ring in rings:
+        px, py, pz = xyz[ring[0]] if ring else (0.0, 0.0, 0.0)
+        spokes = [(xyz[k][0] - px, xyz[k][1] - py, xyz[k][2] - pz) for k in ring[1:]]
+        for (ux, uy, uz), (vx, vy, vz) in pairwise(spokes):
+            x += 0.5 * (uy * vz - uz * vy)
+            y += 0.5 * (uz * vx - ux * vz)
+            z += 0.5 * (ux * vy - uy * vx)
+    return x, y, z
 
 
-@kernel
-def _neighbours(
-    corners: IntArray, ring_offsets: IntArray, face_rings: IntArray, vertices: int
-) -> tuple[LabelArray, IntArray]:
-    """Faces that share an edge with each face: offsets (f + 1,) and faces, a face once for every common edge."""
-    keys = np.empty(len(corners), np.int64)
-    owner = np.empty(len(corners), np.int64)
-    faces = len(face_rings) - 1
-    for f in range(faces):
-        for r in range(face_rings[f], face_rings[f + 1]):
-            for k in range(ring_offsets[r], ring_offsets[r + 1]):
-                following = k + 1 if k + 1 < ring_offsets[r + 1] else ring_offsets[r]
-                a, b = min(corners[k], corners[following]), max(corners[k], corners[following])
-                keys[k] = a * vertices + b
-                owner[k] = f
-    order = ascending_order(keys)
-    # Every pair of faces at an edge, both ways: the first pass counts, the second one writes.
-    beside, others = np.empty(0, np.int32), np.empty(0, np.int64)
-    for writes in (False, True):
-        count = 0
-        start = 0
-        while start < len(order):
-            stop = start + 1
-            while stop < len(order) and keys[order[stop]] == keys[order[start]]:
-                stop += 1
-            for i in range(start, stop):
-                for j in range(start, stop):
-                    if owner[order[i]] != owner[order[j]]:
-                        if writes:
-                            beside[count], others[count] = owner[order[i]], owner[order[j]]
-                        count += 1
-            start = stop
-        if not writes:
-            beside, others = np.empty(count, np.int32), np.empty(count, np.int64)
-    offsets, members = counting_sort(beside, faces)
-    ordered = np.empty(len(members), np.int64)
-    for m in range(len(members)):
-        ordered[m] = others[members[m]]
-    return offsets, ordered
+def _neighbours(faces: Sequence[Rings]) -> list[list[int]]:
+    """Faces that share an edge with each face, one once for every common edge, in the order of the edges."""
+    owners: dict[tuple[int, int], list[int]] = {}
+    for number, rings in enumerate(faces):
+        for ring in rings:
+            for a, b in zip(ring, (*ring[1:], *ring[:1]), strict=True):
+                owners.setdefault((min(a, b), max(a, b)), []).append(number)
+    beside: list[list[int]] = [[] for _ in faces]
+    for edge in sorted(owners):
+        for one in owners[edge]:
+            beside[one].extend(other for other in owners[edge] if other != one)
+    return beside
 
 
-@kernel
-def _min_cosine(xyz: FloatArray, corners: IntArray, area: float, distance_m: float, angle_deg: float) -> float:
-    """Cosine of the largest angle that a face may have to a plane that it lies in: what a small error explains."""
-    extent = 0.0
-    for axis in range(3):
-        low, high = xyz[corners[0], axis], xyz[corners[0], axis]
-        for k in range(len(corners)):
-            low, high = min(low, xyz[corners[k], axis]), max(high, xyz[corners[k], axis])
-        extent += (high - low) ** 2
-    width = 2.0 * area / math.sqrt(extent) if extent > 0.0 else 0.0
-    explained = math.atan2(distance_m, width)
-    return math.cos(max(math.radians(angle_deg), explained))
+class _Face(NamedTuple):
+    """A face with its normal turned upwards."""
+
+    corners: list[Point]
+    area: float
+    normal: Point
+
+    @property
+    def min_cosine(self) -> float:
+        """Cosine of the largest angle that it may have to a plane that it lies in: what a small error explains."""
+        spans = [max(axis) - min(axis) for axis in zip(*self.corners, strict=True)]
+        extent = math.sqrt(sum(span * span for span in spans))
+        width = 2.0 * self.area / extent if extent > 0.0 else 0.0
+        return math.cos(max(math.radians(ANGLE_DEG), math.atan2(DISTANCE_M, width)))
 
 
-@kernel(inline="always")
-def _upward_normals(vectors: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Lengths (f,) of area vectors (f, 3), and their unit vectors (f, 3), turned upwards; zero without an area."""
-    areas, normals = np.empty(len(vectors)), np.zeros((len(vectors), 3))
-    for f in range(len(vectors)):
-        areas[f] = math.sqrt(vectors[f, 0] ** 2 + vectors[f, 1] ** 2 + vectors[f, 2] ** 2)
-        if areas[f] > 0.0:
-            scale = (1.0 if vectors[f, 2] >= 0.0 else -1.0) / areas[f]
-            for axis in range(3):
-                normals[f, axis] = vectors[f, axis] * scale
-    return areas, normals
+def _face(xyz: Sequence[Point], rings: Rings, vector: Point) -> _Face:
+    x, y, z = vector
+    area = math.sqrt(x * x + y * y + z * z)
+    scale = (1.0 if z >= 0.0 else -1.0) / area if area > 0.0 else 0.0
+    return _Face([xyz[k] for k in chain.from_iterable(rings)], area, (x * scale, y * scale, z * scale))
 
 
-@kernel(inline="always")
-def _lie_in(xyz: FloatArray, corners: IntArray, plane: tuple[float, float, float], up: float, limit_m: float) -> bool:
-    """Whether vertices lie within a distance of the plane z = a x + b y + c; `up` is the z of its unit normal."""
-    a, b, c = plane
-    inside = True
-    for k in range(len(corners)):
-        x, y, z = xyz[corners[k], 0], xyz[corners[k], 1], xyz[corners[k], 2]
-        if abs(z - a * x - b * y - c) * up > limit_m:
-            inside = False
-            break
-    return inside
+class _Plane:
+    """A plane z = a x + b y + c that is fitted anew to each face that joins; it starts with the normal of the first."""
+
+    def __init__(self, face: _Face) -> None:
+        self.sums = [0.0] * 9
+        self.a, self.b = -face.normal[0] / face.normal[2], -face.normal[1] / face.normal[2]
+        self._add(face.corners)
+
+    def _add(self, corners: Iterable[Point]) -> None:
+        n, sx, sy, sz, sxx, sxy, syy, sxz, syz = self.sums
+        for x, y, z in corners:
+            n, sx, sy, sz = n + 1.0, sx + x, sy + y, sz + z
+            sxx, sxy, syy, sxz, syz = sxx + x * x, sxy + x * y, syy + y * y, sxz + x * z, syz + y * z
+        self.sums = [n, sx, sy, sz, sxx, sxy, syy, sxz, syz]
+        self.c = (sz - self.a * sx - self.b * sy) / n
+        self.up = 1.0 / math.sqrt(1.0 + self.a * self.a + self.b * self.b)
+
+    def join(self, face: _Face) -> None:
+        """Fit it to the vertices of another face, too."""
+        self._add(face.corners)
+        n, sx, sy, sz, sxx, sxy, syy, sxz, syz = self.sums
+        self.a, self.b = solve_plane_moments(
+            sxx - sx * sx / n, sxy - sx * sy / n, syy - sy * sy / n, sxz - sx * sz / n, syz - sy * sz / n
+        )
+        self._add(())
+
+    def has(self, face: _Face) -> bool:
+        """Whether a face lies in it."""
+        a, b, c, up = self.a, self.b, self.c, self.up
+        if face.normal[2] <= _MIN_UP or any(abs(z - a * x - b * y - c) * up > DISTANCE_M for x, y, z in face.corners):
+            return False
+        return (face.normal[2] - a * face.normal[0] - b * face.normal[1]) * up >= face.min_cosine
 
 
-@kernel
 def coplanar_regions(
-    xyz: FloatArray,
-    corners: IntArray,
-    ring_offsets: IntArray,
-    face_rings: IntArray,
-    vectors: FloatArray,
-    planes: IntArray,
-    distance_m: float,
-    angle_deg: float,
-) -> IntArray:
+    xyz: Sequence[Point], faces: Sequence[Rings], vectors: Sequence[Point], planes: Sequence[int]
+) -> list[int]:
     """Regions of faces that share edges and lie in one plane, grown from the largest; each new face refits the plane.
 
-    Faces are given as for `face_vectors`, with one vertex per place. The direction of their area vectors (f, 3) does
-    not matter; faces with different `planes` (f,) stay apart. Returns the number of the region of each face, (f,), in
-    the order of growing.
+    Faces have one vertex per place. The direction of their area vectors does not matter; faces with different `planes`
+    stay apart. Returns the number of the region of each face, in the order of growing.
     """
-    areas, normals = _upward_normals(vectors)
-    offsets, others = _neighbours(corners, ring_offsets, face_rings, len(xyz))
-    labels = np.full(len(vectors), -1, np.int64)
-    queue = np.empty(len(vectors), np.int64)
-    count = 0
-    for seed in ascending_order(-areas):
+    shapes = [_face(xyz, rings, vector) for rings, vector in zip(faces, vectors, strict=True)]
+    beside = _neighbours(faces)
+    labels = [-1] * len(faces)
+    numbers = count()
+    for seed in sorted(range(len(faces)), key=lambda face: -shapes[face].area):
         if labels[seed] >= 0:
             continue
-        labels[seed] = count
-        queue[0] = seed
-        read, written = 0, 1
-        a, b, c = 0.0, 0.0, 0.0
-        n, sx, sy, sz = 0.0, 0.0, 0.0, 0.0
-        sxx, sxy, syy, sxz, syz = 0.0, 0.0, 0.0, 0.0, 0.0
-        joining = seed
-        while normals[seed, 2] > _MIN_UP:
-            if joining >= 0:
-                for k in range(ring_offsets[face_rings[joining]], ring_offsets[face_rings[joining + 1]]):
-                    x, y, z = xyz[corners[k], 0], xyz[corners[k], 1], xyz[corners[k], 2]
-                    n += 1.0
-                    sx, sy, sz = sx + x, sy + y, sz + z
-                    sxx, sxy, syy = sxx + x * x, sxy + x * y, syy + y * y
-                    sxz, syz = sxz + x * z, syz + y * z
-                if joining == seed:
-                    a, b = -normals[seed, 0] / normals[seed, 2], -normals[seed, 1] / normals[seed, 2]
-                else:
-                    a, b = solve_plane_moments(
-                        sxx - sx * sx / n, sxy - sx * sy / n, syy - sy * sy / n, sxz - sx * sz / n, syz - sy * sz / n
-                    )
-                c = (sz - a * sx - b * sy) / n
-                joining = -1
-            if read == written:
-                break
-            face = queue[read]
-            up = 1.0 / math.sqrt(1.0 + a * a + b * b)
-            for q in range(offsets[face], offsets[face + 1]):
-                other = others[q]
-                if labels[other] >= 0 or planes[other] != planes[seed] or normals[other, 2] <= _MIN_UP:
-                    continue
-                own = corners[ring_offsets[face_rings[other]] : ring_offsets[face_rings[other + 1]]]
-                cosine = (normals[other, 2] - a * normals[other, 0] - b * normals[other, 1]) * up
-                fits = _lie_in(xyz, own, (a, b, c), up, distance_m)
-                if fits and cosine >= _min_cosine(xyz, own, areas[other], distance_m, angle_deg):
-                    labels[other] = count
-                    queue[written] = other
-                    written += 1
-                    joining = other
+        labels[seed] = next(numbers)
+        if shapes[seed].normal[2] <= _MIN_UP:
+            continue
+        plane = _Plane(shapes[seed])
+        region = [seed]
+        for face in region:
+            while True:
+                free = (other for other in beside[face] if labels[other] < 0 and planes[other] == planes[seed])
+                joining = next((other for other in free if plane.has(shapes[other])), None)
+                if joining is None:
                     break
-            if joining < 0:
-                read += 1
-        count += 1
+                labels[joining] = labels[seed]
+                region.append(joining)
+                plane.join(shapes[joining])
     return labels

@@ -38,7 +38,6 @@ class RawPart:
     xyz: FloatArray
     """(v, 3) float64, absolute metres; only vertices that its faces use."""
     faces: tuple[RawFace, ...]
-    """Its polygons."""
     is_solid: bool
     """True if they are meant to close a solid."""
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from itertools import chain
 
 import numpy as np
 import shapely
@@ -19,7 +18,7 @@ from shapely import MultiPolygon, Polygon
 
 from pipeline.model import BoolArray, FaceKind, FloatArray, IntArray, Solid, SolidFace
 from pipeline.ruler.evaluation.models import RoofSurface
-from pipeline.ruler.evaluation.reading.coplanar import ANGLE_DEG, DISTANCE_M, coplanar_regions, face_vectors
+from pipeline.ruler.evaluation.reading.coplanar import DISTANCE_M, area_vector, coplanar_regions
 from pipeline.ruler.evaluation.reading.raw import MILLIMETRES_PER_METRE, RawPart
 from pipeline.segmentation.facet_geometry import fit_plane_coefficients
 
@@ -53,7 +52,7 @@ class Assembled:
 
 
 class _Soup:
-    """All faces of a building as flat arrays, about an origin in whole metres."""
+    """All faces of a building, about an origin in whole metres."""
 
     def __init__(self, parts: Sequence[RawPart]) -> None:
         xyz = np.vstack([part.xyz for part in parts])
@@ -63,51 +62,30 @@ class _Soup:
         self.first_vertex = np.concatenate([[0], np.cumsum([len(part.xyz) for part in parts])])
         self.faces = [face for part in parts for face in part.faces]
         self.part = np.repeat(np.arange(len(parts)), [len(part.faces) for part in parts])
-        rings = [ring for face in self.faces for ring in face.rings]
-        self.ring_offsets = _offsets([len(ring) for ring in rings])
-        self.face_rings = _offsets([len(face.rings) for face in self.faces])
-        counts = np.diff(self.ring_offsets[self.face_rings])
-        shift = np.repeat(self.first_vertex[self.part], counts)
-        self.corners = np.fromiter(chain.from_iterable(rings), np.int64, len(shift)) + shift
-        self.vectors = face_vectors(self.local, self.corners, self.ring_offsets, self.face_rings)
+        firsts = self.first_vertex[self.part].tolist()
+        self.rings = [
+            [[k + first for k in ring] for ring in face.rings] for face, first in zip(self.faces, firsts, strict=True)
+        ]
+        self.xyz = self.local.tolist()
+        self.vectors = np.array([area_vector(self.xyz, rings) for rings in self.rings])
         places: dict[tuple[int, ...], int] = {}
-        first = [places.setdefault(tuple(key), k) for k, key in enumerate(self.millimetres.tolist())]
-        self.welded = np.array(first, np.int64)[self.corners]
+        at = [places.setdefault(tuple(key), k) for k, key in enumerate(self.millimetres.tolist())]
+        self.welded = [[[at[k] for k in ring] for ring in rings] for rings in self.rings]
 
-    def corners_of(self, face: int) -> IntArray:
-        """Vertices of all rings of a face, one for all in the same place."""
-        first, last = self.face_rings[face], self.face_rings[face + 1]
-        corners: IntArray = self.welded[self.ring_offsets[first] : self.ring_offsets[last]]
-        return corners
+    def corners_of(self, *faces: int) -> list[int]:
+        """Vertices of all rings of some faces, one for all in the same place."""
+        return [corner for face in faces for ring in self.welded[face] for corner in ring]
 
     def plan(self, faces: IntArray) -> list[Polygon | MultiPolygon]:
         """The faces in plan, metres about the origin, on the grid, valid; empty where they have no area."""
         xy = self.millimetres[:, :2] / MILLIMETRES_PER_METRE
         polygons = []
         for face in faces:
-            rings = []
-            for ring in range(self.face_rings[face], self.face_rings[face + 1]):
-                corners = self.corners[self.ring_offsets[ring] : self.ring_offsets[ring + 1]]
-                if len(corners) >= 3:
-                    rings.append(xy[corners])
+            rings = [xy[ring] for ring in self.rings[face] if len(ring) >= 3]
             polygons.append(Polygon(rings[0], rings[1:]) if rings else Polygon())
         for k in np.flatnonzero(~shapely.is_valid(polygons)):
             polygons[k] = _areas_of(shapely.make_valid(polygons[k]))
         return polygons
-
-    def subset(self, faces: IntArray) -> tuple[IntArray, IntArray, IntArray]:
-        """Corners of some faces, one vertex for all in the same place, their ring offsets and face offsets."""
-        rings = np.concatenate([np.arange(self.face_rings[f], self.face_rings[f + 1]) for f in faces])
-        lengths = np.diff(self.ring_offsets)[rings]
-        corners = np.concatenate([self.corners_of(int(face)) for face in faces])
-        return corners, _offsets(lengths.tolist()), _offsets(np.diff(self.face_rings)[faces].tolist())
-
-
-def _offsets(lengths: Sequence[int]) -> IntArray:
-    """Where each of consecutive runs starts, and where the last ends."""
-    offsets = np.zeros(len(lengths) + 1, np.int64)
-    np.cumsum(lengths, out=offsets[1:])
-    return offsets
 
 
 def _areas_of(geometry: shapely.Geometry) -> Polygon | MultiPolygon:
@@ -203,11 +181,12 @@ def _kinds_by_normal(soup: _Soup) -> list[FaceKind]:
     open one whose faces look outward.
     """
     lengths = np.linalg.norm(soup.vectors, axis=1)
-    counts = np.diff(soup.ring_offsets[soup.face_rings])
+    counts = [sum(map(len, rings)) for rings in soup.rings]
     owner = np.repeat(np.arange(len(soup.faces)), counts)
-    heights = np.bincount(owner, soup.local[soup.corners, 2], len(soup.faces)) / np.maximum(counts, 1)
+    z = soup.local[[corner for rings in soup.rings for ring in rings for corner in ring], 2]
+    heights = np.bincount(owner, z, len(soup.faces)) / np.maximum(counts, 1)
     low = np.full(soup.part[-1] + 1, np.inf)
-    np.minimum.at(low, soup.part[owner], soup.local[soup.corners, 2])
+    np.minimum.at(low, soup.part[owner], z)
     low[~np.isfinite(low)] = 0.0
     volumes = np.bincount(soup.part, soup.vectors[:, 2] * (heights - low[soup.part]), len(low))
     flat = np.bincount(soup.part, soup.vectors[:, 2], len(low))
@@ -250,11 +229,10 @@ def _height(soup: _Soup, face: int, x: float, y: float) -> float:
 
 def _regions(soup: _Soup, roofs: IntArray, planes: IntArray) -> list[IntArray]:
     """Roof faces gathered by plane, each sorted, in the order of their first faces."""
-    corners, ring_offsets, face_rings = soup.subset(roofs)
-    vectors = soup.vectors[roofs]
-    labels = coplanar_regions(soup.local, corners, ring_offsets, face_rings, vectors, planes, DISTANCE_M, ANGLE_DEG)
     regions: dict[int, list[int]] = {}
-    for face, label in zip(roofs.tolist(), labels.tolist(), strict=True):
+    own = [soup.welded[face] for face in roofs]
+    labels = coplanar_regions(soup.xyz, own, soup.vectors[roofs].tolist(), planes.tolist())
+    for face, label in zip(roofs.tolist(), labels, strict=True):
         regions.setdefault(label, []).append(face)
     merged: list[list[int]] = []
     of_plane: dict[int, int] = {}
@@ -271,15 +249,14 @@ def _regions(soup: _Soup, roofs: IntArray, planes: IntArray) -> list[IntArray]:
 def _in_one_plane(soup: _Soup, faces: Sequence[int], others: Sequence[int]) -> bool:
     """Whether the vertices of other faces lie in the plane of some faces."""
     a, b, c = _fitted(soup, faces)
-    xyz = soup.local[np.concatenate([soup.corners_of(face) for face in others])]
+    xyz = soup.local[soup.corners_of(*others)]
     distance = np.abs(xyz[:, 2] - a * xyz[:, 0] - b * xyz[:, 1] - c) / np.sqrt(1.0 + a * a + b * b)
     return bool(distance.max() <= DISTANCE_M)
 
 
 def _fitted(soup: _Soup, faces: Sequence[int] | IntArray) -> Coefficients:
     """The least-squares plane of the vertices of some faces, each place once."""
-    corners = np.concatenate([soup.corners_of(int(face)) for face in faces])
-    a, b, c, _ = fit_plane_coefficients(soup.local, np.unique(corners).astype(np.int32))
+    a, b, c, _ = fit_plane_coefficients(soup.local, np.unique(soup.corners_of(*faces)).astype(np.int32))
     return a, b, c
 
 

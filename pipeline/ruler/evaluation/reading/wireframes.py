@@ -24,7 +24,6 @@ class Wireframe:
     """The roof edges of one building."""
 
     building_id: str
-    """Its name."""
     vertices: FloatArray
     """(v, 3) float64, metres."""
     edges: IntArray

@@ -1,47 +1,29 @@
-import { chunks } from "./json_lines";
+import { chunks, linesOf } from "./lines";
 import { Problem, request } from "./requests";
 
 /** One server-sent event. */
 export interface ServerEvent {
-  event: string;
   data: string;
+  /** Its id; that of an event before if it has none. */
   id: string;
+  /** Milliseconds that the server asks to wait before connecting again; null if it has not asked. */
+  retryMs: number | null;
 }
 
-/** Reads text/event-stream (WHATWG HTML, 9.2) in pieces of any size. */
-export class EventStreamReader {
-  private rest = "";
-  private event = "";
-  private id = "";
-  private data: string[] = [];
-  /** Milliseconds that the server asks to wait before connecting again. */
-  retryMs: number | null = null;
-
-  *read(text: string): Generator<ServerEvent> {
-    const lines = (this.rest + text).split(/\r\n|\n|\r(?!$)/);
-    this.rest = lines.pop() ?? "";
-    for (const line of lines) {
-      const event = this.line(line);
-      if (event !== null) yield event;
-    }
-  }
-
-  private line(line: string): ServerEvent | null {
+/** The events of text/event-stream (WHATWG HTML, 9.2). */
+export async function* eventsOf(stream: AsyncIterable<Uint8Array>): AsyncGenerator<ServerEvent> {
+  let data: string[] = [];
+  let id = "";
+  let retryMs: number | null = null;
+  for await (const line of linesOf(stream)) {
     if (line === "") {
-      const event = { event: this.event || "message", data: this.data.join("\n"), id: this.id };
-      const empty = this.data.length === 0;
-      this.event = "";
-      this.data = [];
-      return empty ? null : event;
+      if (data.length > 0) yield { data: data.join("\n"), id, retryMs };
+      data = [];
     }
-    const colon = line.indexOf(":");
-    const field = colon < 0 ? line : line.slice(0, colon);
-    const value = colon < 0 ? "" : line.slice(colon + 1).replace(/^ /, "");
-    if (field === "event") this.event = value;
-    else if (field === "data") this.data.push(value);
-    else if (field === "id" && !value.includes("\0")) this.id = value;
-    else if (field === "retry" && /^\d+$/.test(value)) this.retryMs = Number(value);
-    return null;
+    const [, field, value = ""] = /^(\w+)(?:: ?(.*))?$/.exec(line) ?? [];
+    if (field === "data") data.push(value);
+    else if (field === "id" && !value.includes("\0")) id = value;
+    else if (field === "retry" && /^\d+$/.test(value)) retryMs = Number(value);
   }
 }
 
@@ -68,15 +50,10 @@ export async function follow(
       if (response.status === 204) return; // the job is over and all events are known
       onConnection(true);
       waitMs = 1000;
-      const reader = new EventStreamReader();
-      const decoder = new TextDecoder();
-      if (response.body === null) throw new TypeError("the answer has no body");
-      for await (const bytes of chunks(response.body)) {
-        for (const event of reader.read(decoder.decode(bytes, { stream: true }))) {
-          if (event.id !== "") last = event.id;
-          if (onEvent(event)) return;
-        }
-        waitMs = reader.retryMs ?? waitMs;
+      for await (const event of eventsOf(chunks(response.body))) {
+        if (event.id !== "") last = event.id;
+        if (onEvent(event)) return;
+        waitMs = event.retryMs ?? waitMs;
       }
     } catch (error) {
       if (signal.aborted) throw error;
@@ -88,8 +65,10 @@ export async function follow(
   }
 }
 
-function waited(milliseconds: number, signal: AbortSignal): Promise<void> {
+/** Wait; an AbortError ends it early. */
+export function waited(milliseconds: number, signal: AbortSignal): Promise<void> {
   return new Promise((resolve, reject) => {
+    signal.throwIfAborted();
     const timer = setTimeout(resolve, milliseconds);
     signal.addEventListener("abort", () => {
       clearTimeout(timer);

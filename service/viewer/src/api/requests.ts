@@ -5,6 +5,15 @@ import type { Preflight, RunReport, Status, UploadInfo } from "./types";
 
 const KEY = "gablework.key";
 
+/** The event of the document when a request needed a key, or another one; its detail is the problem. */
+export const KEY_NEEDED = "key-needed";
+
+declare global {
+  interface DocumentEventMap {
+    [KEY_NEEDED]: CustomEvent<Problem>;
+  }
+}
+
 /** An error from the service as application/problem+json, or from the network. */
 export class Problem extends Error {
   constructor(
@@ -35,6 +44,19 @@ export function ofRun(path: string, method: string | null): string {
   if (method === null) return path;
   return `${path}${path.includes("?") ? "&" : "?"}method=${encodeURIComponent(method)}`;
 }
+
+/** A job, or one run of a comparison. */
+export interface Run {
+  readonly jobPath: string;
+  /** The run of a comparison; null for other jobs. */
+  readonly method: string | null;
+}
+
+/** The path of a part of a run. */
+export const partOf = ({ jobPath, method }: Run, part: string): string => ofRun(`${jobPath}/${part}`, method);
+
+/** The path of a building of a run, or of a part of it. */
+export const buildingOf = (run: Run, id: string, part = ""): string => partOf(run, `buildings/${encodeURIComponent(id)}${part}`);
 
 /** The name of a variant in a comparison: the preset is named only if it is not the usual one. */
 export function variantOf(method: string, preset: string, usualPreset: string): string {
@@ -74,7 +96,9 @@ export async function request(path: string, options: RequestInit = {}): Promise<
     throw unreachable();
   }
   if (response.ok) return response;
-  throw problemOf(response.status, response.statusText, await response.text(), response.headers.get("Retry-After"));
+  const problem = problemOf(response.status, response.statusText, await response.text(), response.headers.get("Retry-After"));
+  if (problem.status === 401) document.dispatchEvent(new CustomEvent(KEY_NEEDED, { detail: problem }));
+  throw problem;
 }
 
 export async function getJson<T>(path: string, options: RequestInit = {}): Promise<T> {
@@ -87,8 +111,8 @@ export function sendJson(method: string, path: string, body: unknown, headers: R
 }
 
 /** The report of a run; empty if the request left it out. */
-export async function runReport(jobPath: string, method: string | null, signal: AbortSignal): Promise<RunReport> {
-  return (await orNull(getJson<RunReport>(ofRun(`${jobPath}/results/report`, method), { signal }))) ?? {};
+export async function runReport(run: Run, signal: AbortSignal): Promise<RunReport> {
+  return (await orNull(getJson<RunReport>(partOf(run, "results/report"), { signal }))) ?? {};
 }
 
 /** Null for what the service does not have, such as the decisions of older jobs. */
@@ -107,15 +131,16 @@ export function unreachable(): Problem {
 
 /** A problem from an answer; for another body the text of the status line. */
 export function problemOf(status: number, reason: string, body: string, retryAfter: string | null): Problem {
-  let document: { type?: unknown; title?: unknown; detail?: unknown } = {};
+  let document: Record<string, unknown> = {};
   try {
-    document = JSON.parse(body) as typeof document;
+    document = (JSON.parse(body) as typeof document | null) ?? {};
   } catch {
-    document = {};
+    // the status says what is known
   }
-  const title = typeof document?.title === "string" ? document.title : reason || `Status ${status}`;
-  const detail = typeof document?.detail === "string" ? document.detail : "";
-  const kind = typeof document?.type === "string" ? (document.type.split(/[:/]/).at(-1) ?? "") : "";
+  const text = (name: string): string => (typeof document[name] === "string" ? document[name] : "");
+  const title = text("title") || reason || `Status ${status}`;
+  const detail = text("detail");
+  const kind = text("type").split(/[:/]/).at(-1) ?? "";
   // about keys, the service speaks to programmers and operators
   if (kind === "unauthorized") return new Problem(status, "This service needs a key", "", remedyOf(status, retryAfter), kind);
   if (kind === "forbidden") return new Problem(status, title, detail.split(": ")[0] ?? "", remedyOf(status, retryAfter), kind);
@@ -132,30 +157,26 @@ const REMEDIES: Record<string, string> = {
   "not-replayable": "Wait until the attempt that is under way is over.",
 };
 
+const CORRECT = "Correct what is named above and send it again.";
+const REMOVED = "It may have been removed. Go back to the list.";
+
+const BY_STATUS: Record<number, string> = {
+  400: CORRECT,
+  401: "Enter a valid key. The operator of this service gives you one.",
+  403: "Your key may not do that. Ask the operator of this service for one that may.",
+  404: REMOVED,
+  410: REMOVED,
+  413: "Split the tile, or ask the service's operator to raise the limit.",
+  415: CORRECT,
+  422: CORRECT,
+  429: "Wait a little, then try again.",
+  503: "The service cannot take work at the moment. Try again in a minute.",
+};
+
 function remedyOf(status: number, retryAfter: string | null): string {
-  switch (status) {
-    case 401:
-      return "Enter a valid key. The operator of this service gives you one.";
-    case 403:
-      return "Your key may not do that. Ask the operator of this service for one that may.";
-    case 404:
-    case 410:
-      return "It may have been removed. Go back to the list.";
-    case 413:
-      return "Split the tile, or ask the service's operator to raise the limit.";
-    case 429: {
-      const seconds = Number(retryAfter);
-      return seconds > 0 ? `Try again in ${counted(Math.ceil(seconds), "second")}.` : "Wait a little, then try again.";
-    }
-    case 400:
-    case 415:
-    case 422:
-      return "Correct what is named above and send it again.";
-    case 503:
-      return "The service cannot take work at the moment. Try again in a minute.";
-    default:
-      return status >= 500 ? "This is a fault of the service: its operator finds more in its log." : "";
-  }
+  const seconds = Number(retryAfter);
+  if (status === 429 && seconds > 0) return `Try again in ${counted(Math.ceil(seconds), "second")}.`;
+  return BY_STATUS[status] ?? (status >= 500 ? "This is a fault of the service: its operator finds more in its log." : "");
 }
 
 /**

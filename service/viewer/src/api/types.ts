@@ -24,7 +24,6 @@ export interface StatusInfo {
   created?: string;
   started?: string;
   finished?: string;
-  updated?: string;
   title?: string;
   stage?: string;
   /** The schedule that made the job. */
@@ -118,7 +117,6 @@ export interface ScheduleRun {
   trigger: "clock" | "hand";
   outcome: string;
   slot?: string;
-  firstSlot?: string;
   slots: number;
   moreSlots?: boolean;
   jobID?: string;

@@ -2,24 +2,25 @@
 
 import { getJson, pathOfJob } from "../api/requests";
 import type { StatusInfo } from "../api/types";
-import { titleOf } from "../jobs/job_words";
+import { titleOf, whenWords } from "../jobs/job_words";
 import type { Batch, Listed } from "../models/batching";
 import { originInMetres } from "../models/building_mesh";
 import { CHANGES, LIMITS, pairs, type Change, type Pair, type Placed } from "../models/pairing";
 import { RunObjects } from "../models/run_objects";
+import { countOf } from "../models/selection";
 import { hashOf, partsOf, type Address } from "../page/address";
-import { colourSwatch, el } from "../page/elements";
+import { button, colourSwatch, el, type Properties } from "../page/elements";
 import { choice, field } from "../page/form_fields";
-import { announce, asProblem, problemNotice, warningNotice } from "../page/notices";
-import { nothing, table } from "../page/tables";
-import type { Hooks, View } from "../page/view";
+import { announce, report, warningNotice } from "../page/notices";
+import { sheet } from "../page/sheet";
+import { nothing, table, type Column } from "../page/tables";
+import { Tick } from "../page/tick";
+import type { View } from "../page/view";
 import type { OnMove } from "../scene/camera";
 import { ModelScene } from "../scene/scene";
-import { ago, count, counted, measure } from "../words/numbers";
+import { count, counted, measure } from "../words/numbers";
 import { CATEGORIES } from "../words/roof_types";
 import "./changes_view.css";
-import "../page/dialogs.css";
-import "../page/pages.css";
 
 const OFFERED = 100;
 const STEP = 100;
@@ -36,11 +37,7 @@ interface Loaded {
   batches: Batch[];
 }
 
-export function showChanges(place: HTMLElement, address: Address, hooks: Hooks): View {
-  const view = new Changes(place, hooks);
-  view.follow(address);
-  return view;
-}
+export const showChanges = (place: HTMLElement): View => new Changes(place);
 
 class Changes implements View {
   private calledOff = new AbortController();
@@ -63,31 +60,31 @@ class Changes implements View {
       `${100 * LIMITS.areaShare} % and ${LIMITS.areaM2} m². It is a quick look: gablework batch diff judges two surveys with their accuracy.`,
   );
 
-  constructor(
-    place: HTMLElement,
-    private readonly hooks: Hooks,
-  ) {
-    document.title = "Side by side · gablework";
+  private readonly columns: Column<Pair>[] = [
+    {
+      head: "Building",
+      cell: (pair) => [
+        el("a", { class: "change", href: this.address(idOf(pair)) }, colourSwatch(CHANGES[pair.change].colour), CHANGES[pair.change].label),
+        el("span", { class: "sub" }, el("code", {}, idOf(pair).slice(0, 10))),
+      ],
+    },
+    { head: "What differs", cell: ({ differences, change }) => differences.join("; ") || CHANGES[change].words },
+    { head: "Left", kind: "only-wide", cell: (pair) => figures(pair.old) },
+    { head: "Right", kind: "only-wide", cell: (pair) => figures(pair.new) },
+  ];
+
+  constructor(place: HTMLElement) {
     const [old, now] = this.selects;
     for (const select of this.selects) select.addEventListener("change", () => this.choose());
-    const swap = el("button", { type: "button", "aria-label": "Swap left and right" }, "⇄");
-    swap.addEventListener("click", () => {
+    const swap = (): void => {
       [old.value, now.value] = [now.value, old.value];
       this.choose();
-    });
-    place.replaceChildren(
-      el(
-        "div",
-        { class: "sheet sheet-wide" },
-        el("div", { class: "sheet-head" }, el("h1", {}, "Side by side")),
-        el("div", { class: "sides" }, field("Left, or older", old), swap, field("Right, or newer", now)),
-        this.note,
-        this.stage,
-        this.legend,
-        this.list,
-        this.explanation,
-      ),
-    );
+    };
+    const swapper = button("⇄", swap, { "aria-label": "Swap left and right" });
+    const sides = el("div", { class: "sides" }, field("Left, or older", old), swapper, field("Right, or newer", now));
+    const all = sheet("Side by side", [], sides, this.note, this.stage, this.legend, this.list, this.explanation);
+    all.classList.add("sheet-wide");
+    place.replaceChildren(all);
   }
 
   follow({ query }: Address): void {
@@ -107,14 +104,10 @@ class Changes implements View {
     const { signal } = (this.calledOff = new AbortController());
     this.load(signal).catch((error: unknown) => {
       if (signal.aborted) return;
-      const problem = asProblem(error);
-      this.note.replaceChildren(
-        problemNotice(problem, () => {
-          this.shownSides = "";
-          this.follow(partsOf(location.hash));
-        }),
-      );
-      this.hooks.onProblem(problem);
+      report(this.note, error, () => {
+        this.shownSides = "";
+        this.follow(partsOf(location.hash));
+      });
     });
   }
 
@@ -151,7 +144,6 @@ class Changes implements View {
       if (side === null || jobs.some(({ jobID }) => jobID === side.job)) continue;
       jobs.unshift(await getJson<StatusInfo>(pathOfJob(side.job), { signal }));
     }
-    const now = new Date();
     this.selects.forEach((select, at) => {
       const side = this.sides[at] ?? null;
       select.replaceChildren(
@@ -159,7 +151,7 @@ class Changes implements View {
         ...jobs.flatMap((job) => {
           const runs: (string | null)[] = job.summary?.runs === undefined ? [null] : Object.keys(job.summary.runs);
           return runs.map((method) => {
-            const words = [titleOf(job), method, job.created === undefined ? null : ago(new Date(job.created), now)].filter((part) => part !== null);
+            const words = [titleOf(job), method, whenWords(job)].filter(Boolean);
             const isChosen = side?.job === job.jobID && (side.method ?? runs[0]) === method;
             return el("option", { value: JSON.stringify({ job: job.jobID, method }), selected: isChosen }, words.join(" · "));
           });
@@ -224,42 +216,40 @@ class Changes implements View {
     }
     const [left, right] = this.scenes;
     if (left === null || right === null) return;
-    const [leftColours, rightColours] = [new Map<string, string>(), new Map<string, string>()];
-    for (const { change, old, new: now } of this.found) {
-      if (old !== null) leftColours.set(old.id, CHANGES[change].colour);
-      if (now !== null) rightColours.set(now.id, CHANGES[change].colour);
+    for (const [scene, side] of [[left, "old"], [right, "new"]] as const) {
+      const colours = new Map(this.found.map((pair) => [pair[side]?.id, CHANGES[pair.change].colour]));
+      scene.models.colourBy((id) => colours.get(id) ?? null);
     }
-    left.tint((id) => leftColours.get(id) ?? null);
-    right.tint((id) => rightColours.get(id) ?? null);
     // the frames differ by a shift: the cameras differ by it, too
     const [x, y, z] = shift;
     const by = { x, y, z };
-    const toRight: OnMove = (position, target) => right.look(position.clone().sub(by), target.clone().sub(by));
-    const toLeft: OnMove = (position, target) => left.look(position.clone().add(by), target.clone().add(by));
+    const toRight: OnMove = (position, target) => right.camera.look(position.clone().sub(by), target.clone().sub(by));
+    const toLeft: OnMove = (position, target) => left.camera.look(position.clone().add(by), target.clone().add(by));
     // an empty side has no view of its own
     const [first, second] = loaded[0].batches.length > 0 ? [left, toRight] : [right, toLeft];
-    first.watchCamera(second, true);
-    left.watchCamera(toRight);
-    right.watchCamera(toLeft);
+    first.camera.watch(second, true);
+    left.camera.watch(toRight);
+    right.camera.watch(toLeft);
     canvases.forEach((canvas) => (canvas.dataset["ready"] = "true"));
   }
 
   // --- the list
 
   private fill(): void {
-    const counts = new Map<Change, number>();
-    for (const { change } of this.found) counts.set(change, (counts.get(change) ?? 0) + 1);
+    const counts = countOf(this.found.map(({ change }) => change));
     this.legend.hidden = this.explanation.hidden = false;
     this.legend.replaceChildren(
       ...(Object.keys(CHANGES) as Change[]).filter((change) => counts.has(change)).map((change) => {
-        const box = el("input", { type: "checkbox", checked: !this.hidden.has(change) });
-        box.addEventListener("change", () => {
-          if (box.checked) this.hidden.delete(change);
+        const { label, colour, words } = CHANGES[change];
+        const show = (on: boolean): void => {
+          if (on) this.hidden.delete(change);
           else this.hidden.add(change);
           this.more = STEP;
           this.rows();
-        });
-        return el("label", { class: "legend-row", title: CHANGES[change].words }, box, colourSwatch(CHANGES[change].colour), el("span", { class: "legend-label" }, CHANGES[change].label), el("span", { class: "tally" }, count(counts.get(change) ?? 0)));
+        };
+        const tick = new Tick(label, show, [colourSwatch(colour)], { class: "legend-row", title: words });
+        tick.set(!this.hidden.has(change), counts.get(change) ?? 0);
+        return tick.row;
       }),
     );
     this.rows();
@@ -273,30 +263,15 @@ class Changes implements View {
       return;
     }
     const rest = listed.length - Math.min(this.more, listed.length);
-    const further = el("button", { type: "button", class: "quiet wide", hidden: rest === 0 }, `Show ${count(Math.min(rest, STEP))} more of ${count(rest)}`);
-    further.addEventListener("click", () => {
+    const showMore = (): void => {
       const first = this.more;
       this.more += STEP;
       this.rows();
       this.list.querySelectorAll<HTMLElement>("tbody a")[first]?.focus();
-    });
-    this.list.replaceChildren(
-      table("Differences", ["Building", "What differs", ["Left", "only-wide"], ["Right", "only-wide"]], listed.slice(0, this.more).map((pair) => this.row(pair))),
-      further,
-    );
-  }
-
-  private row({ change, old, new: now, differences }: Pair): HTMLElement {
-    const one = now ?? old;
-    const id = one?.id ?? "";
-    return el(
-      "tr",
-      { "aria-current": id === this.selected ? "true" : null },
-      el("th", { scope: "row" }, el("a", { class: "change", href: this.address(id) }, colourSwatch(CHANGES[change].colour), CHANGES[change].label), el("span", { class: "sub" }, el("code", {}, id.slice(0, 10)))),
-      el("td", {}, differences.join("; ") || CHANGES[change].words),
-      el("td", { class: "only-wide" }, figures(old)),
-      el("td", { class: "only-wide" }, figures(now)),
-    );
+    };
+    const further = button(`Show ${count(Math.min(rest, STEP))} more of ${count(rest)}`, showMore, { class: "quiet wide", hidden: rest === 0 });
+    const isChosen = (pair: Pair): Properties => ({ "aria-current": idOf(pair) === this.selected ? "true" : null });
+    this.list.replaceChildren(table("Differences", this.columns, listed.slice(0, this.more), isChosen), further);
   }
 
   // --- the selection
@@ -313,14 +288,14 @@ class Changes implements View {
   private fromScene = false;
 
   private select(): void {
-    const pair = this.selected === null ? undefined : this.found.find(({ old, new: now }) => (now ?? old)?.id === this.selected);
+    const pair = this.selected === null ? undefined : this.found.find((one) => idOf(one) === this.selected);
     const [left, right] = this.scenes;
     const fly = !this.fromScene;
     this.fromScene = false;
     const [old, now] = [pair?.old?.id ?? null, pair?.new?.id ?? null];
     if (pair !== undefined && fly) this.stage.scrollIntoView({ block: "nearest" }); // on narrow screens it does not stay in view
     // one of the cameras leads
-    const leads = now !== null && right?.has(now) === true ? right : left;
+    const leads = now !== null && right?.models.has(now) === true ? right : left;
     left?.select(old, fly && leads === left);
     right?.select(now, fly && leads === right);
     for (const row of this.list.querySelectorAll("tbody tr")) {
@@ -359,6 +334,8 @@ function placed({ objects, batches }: Loaded, [x, y]: readonly number[]): Placed
   }
   return objects.listed.map((one) => ({ listed: one, plan: plans.get(one.id) ?? null }));
 }
+
+const idOf = ({ old, new: now }: Pair): string => (now ?? old)?.id ?? "";
 
 /** Differences first, the largest of each kind first. */
 function sorted(found: Pair[]): Pair[] {

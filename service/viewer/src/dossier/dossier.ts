@@ -1,29 +1,33 @@
 /** The dossier of a building: its points over the model, the figures that decided, the forms that were tried. */
 
-import { getJson, ofRun, orNull, request, runReport } from "../api/requests";
+import { buildingOf, getJson, orNull, partOf, request, runReport, type Run } from "../api/requests";
 import type { Decision, Feature } from "../api/types";
+import { Batcher, type Batch } from "../models/batching";
 import type { SceneFrame } from "../models/building_mesh";
 import { SequenceReader, type Building } from "../models/cityjson";
 import { CYCLE } from "../models/colouring";
 import { COLUMNS, shown } from "../models/columns";
-import { ringsOf } from "../models/rings";
+import { flatOutlines } from "../models/failed_footprints";
+import { ringsOf } from "../models/plan";
 import { elevationUnitM, inMetres, modelUnits } from "../models/units";
-import { el, svg } from "../page/elements";
-import { asProblem, problemNotice } from "../page/notices";
+import { button, el, svg } from "../page/elements";
+import { report } from "../page/notices";
 import { RESIDUALS } from "../points/points_colouring";
 import { capital } from "../words/fields";
 import { count, counted, measure } from "../words/numbers";
 import { CATEGORIES, categoryOf } from "../words/roof_types";
 import { histogramDrawing, planDrawing, planeColour, sectionDrawing, type Colouring, type Rings } from "./dossier_drawings";
-import { histogram, modelOf, roofEdges, sectionOf, strip, stripWidth, type Points } from "./dossier_geometry";
-import { pointsIn } from "./dossier_points";
-import { checkRows, formRows, LEAD, trust, trustFigures, withinWords } from "./dossier_words";
+import { histogram, modelOf, pointsIn, roofEdges, sectionOf, strip, stripWidth, type Points } from "./dossier_geometry";
+import type { DossierScene } from "./dossier_scene";
+import { checkRows, formRows, trust, trustFigures, withinWords } from "./dossier_words";
 import "./dossier.css";
 
 interface Loaded {
   properties: Feature["properties"];
   outline: Rings;
   building: Building;
+  /** Its model, or its outline if it has none, to be drawn in 3D. */
+  batches: Batch[];
   frame: SceneFrame;
   crs: string;
   /** Null where the service recorded none. */
@@ -33,7 +37,7 @@ interface Loaded {
 }
 
 /** Show the dossier in front of the page; returns a function that closes it. `onClose` hears of the user's closing. */
-export function openDossier(jobPath: string, method: string | null, buildingId: string, onClose: () => void): () => void {
+export function openDossier(run: Run, buildingId: string, onClose: () => void): () => void {
   const calledOff = new AbortController();
   const body = el("div", { class: "dossier-body", "aria-live": "polite" }, el("p", { class: "loading" }, "Loading…"));
   const dialog = el("dialog", { class: "dossier", "aria-labelledby": "dossier-title" });
@@ -44,12 +48,19 @@ export function openDossier(jobPath: string, method: string | null, buildingId: 
       el("h1", { id: "dossier-title" }, "Dossier"),
       el("code", {}, buildingId),
       el("span", { class: "spacer" }),
-      el("button", { type: "button", class: "quiet", onclick: () => window.print() }, "Print"),
-      el("button", { type: "button", class: "quiet", autofocus: true, onclick: () => dialog.close() }, "Close"),
+      button("Print", () => window.print(), { class: "quiet" }),
+      button("Close", () => dialog.close(), { class: "quiet", autofocus: true }),
     ),
     body,
   );
   let end: () => void = () => undefined;
+  const close = (): void => {
+    if (calledOff.signal.aborted) return;
+    calledOff.abort();
+    end();
+    dialog.remove();
+    document.body.classList.remove("has-dossier");
+  };
   dialog.addEventListener("close", () => {
     close();
     onClose();
@@ -57,39 +68,31 @@ export function openDossier(jobPath: string, method: string | null, buildingId: 
   document.body.append(dialog);
   document.body.classList.add("has-dossier");
   dialog.showModal();
-  load(jobPath, method, buildingId, calledOff.signal).then(
+  load(run, buildingId, calledOff.signal).then(
     (loaded) => {
       if (!calledOff.signal.aborted) end = draw(body, loaded);
     },
     (error: unknown) => {
-      if (!calledOff.signal.aborted) body.replaceChildren(problemNotice(asProblem(error)));
+      if (!calledOff.signal.aborted) report(body, error);
     },
   );
-  function close(): void {
-    if (calledOff.signal.aborted) return;
-    calledOff.abort();
-    end();
-    dialog.remove();
-    document.body.classList.remove("has-dossier");
-  }
   return close;
 }
 
-async function load(jobPath: string, method: string | null, buildingId: string, signal: AbortSignal): Promise<Loaded> {
-  const path = `${jobPath}/buildings/${encodeURIComponent(buildingId)}`;
+async function load(run: Run, id: string, signal: AbortSignal): Promise<Loaded> {
   const geojson = { signal, headers: { Accept: "application/geo+json" } };
-  const offered = await getJson<Record<string, unknown>>(ofRun(`${jobPath}/results`, method), { signal });
+  const offered = await getJson<Record<string, unknown>>(partOf(run, "results"), { signal });
   const [feature, document, report, decisions, points] = await Promise.all([
-    getJson<Feature>(ofRun(`${path}?crs=native`, method), geojson),
-    getJson<{ CityObjects: unknown; vertices: unknown }>(ofRun(`${path}?f=cityjson`, method), { signal }),
-    "report" in offered ? runReport(jobPath, method, signal) : null,
-    orNull(getJson<{ decisions: Decision[] }>(ofRun(`${path}/decisions`, method), { signal })),
-    "tileset" in offered ? pointsOf(ofRun(`${path}/points`, method), signal) : null,
+    getJson<Feature>(buildingOf(run, id, "?crs=native"), geojson),
+    getJson<{ CityObjects: unknown; vertices: unknown }>(buildingOf(run, id, "?f=cityjson"), { signal }),
+    "report" in offered ? runReport(run, signal) : null,
+    orNull(getJson<{ decisions: Decision[] }>(buildingOf(run, id, "/decisions"), { signal })),
+    "tileset" in offered ? pointsOf(buildingOf(run, id, "/points"), signal) : null,
   ]);
   const reader = new SequenceReader();
   reader.read(JSON.stringify({ ...document, CityObjects: {}, vertices: [] }));
   const { CityObjects, vertices } = document;
-  const building = reader.read(JSON.stringify({ type: "CityJSONFeature", id: buildingId, CityObjects, vertices }));
+  const building = reader.read(JSON.stringify({ type: "CityJSONFeature", id, CityObjects, vertices }));
   if (building === null) throw new Error("the model of the building cannot be read");
   const rings = ringsOf(feature.geometry);
   const [x, y] = rings[0]?.[0] ?? [building.vertices[0] ?? 0, building.vertices[1] ?? 0];
@@ -103,11 +106,19 @@ async function load(jobPath: string, method: string | null, buildingId: string, 
     properties: feature.properties,
     outline,
     building,
+    batches: batchesOf(feature, building, frame),
     frame,
     crs: report?.crs?.name ?? "CRS unknown",
     decisions: decisions?.decisions ?? null,
     points: points === null ? null : pointsIn(points, frame),
   };
+}
+
+function batchesOf(feature: Feature, building: Building, frame: SceneFrame): Batch[] {
+  if (building.faces.length === 0) return flatOutlines([feature], "failed", frame, () => 0).batches;
+  const batcher = new Batcher(frame);
+  batcher.add(building);
+  return batcher.take();
 }
 
 /** The points of a building; null for one whose process ended before they were assigned to it. */
@@ -125,11 +136,11 @@ function draw(body: HTMLElement, loaded: Loaded): () => void {
   const plan = el("div", { class: "dossier-drawing" });
   const profile = el("div", { class: "dossier-drawing" });
   const key = el("ul", { class: "dossier-key" });
-  let scene: { colour: (colouring: Colouring) => void; dispose: () => void } | null = null;
+  let scene: DossierScene | null = null;
   let over = false;
   const paint = (colouring: Colouring): void => {
     plan.replaceChildren(planDrawing(outline, edges, section, points, colouring));
-    if (section !== null) profile.replaceChildren(sectionDrawing(model, section, 0, points, halfWidthM, colouring));
+    if (section !== null) profile.replaceChildren(sectionDrawing(model, section, points, halfWidthM, colouring));
     key.replaceChildren(...(points === null ? [] : colourKey(points, colouring)));
     scene?.colour(colouring);
   };
@@ -139,8 +150,8 @@ function draw(body: HTMLElement, loaded: Loaded): () => void {
     role: "img",
     "aria-label": "The model and its points in 3D. Arrow keys turn, plus and minus zoom.",
   });
-  const hasModel = building.faces.length > 0;
-  const space = hasModel || points !== null ? figure("In 3D", "Drag to turn, the wheel zooms.", canvas) : null;
+  const stage = el("div", { class: "dossier-drawing dossier-space stage3d" }, canvas);
+  const space = loaded.batches.length > 0 ? figure("In 3D", "Drag to turn, the wheel zooms.", stage) : null;
   const inStrip = points === null || section === null ? 0 : strip(points, section, halfWidthM).length;
   const stripWords = points === null ? "" : ` ${counted(inStrip, "point")} within ${measure(halfWidthM, 1, "m")} of the line.`;
   body.replaceChildren(
@@ -163,17 +174,11 @@ function draw(body: HTMLElement, loaded: Loaded): () => void {
   const first: Colouring = "residual";
   paint(first);
   if (space !== null) {
-    import("./dossier_scene").then(
-      ({ DossierScene }) => {
-        if (over) return;
-        try {
-          scene = new DossierScene(canvas, building, frame, points, colouringOf(body));
-        } catch {
-          canvas.replaceWith(el("p", { class: "hint" }, "This browser cannot draw in 3D."));
-        }
-      },
-      () => canvas.replaceWith(el("p", { class: "hint" }, "The 3D view could not be loaded.")),
-    );
+    import("./dossier_scene")
+      .then((loaded3d) => {
+        if (!over) scene = new loaded3d.DossierScene(canvas, loaded.batches, points, colouringOf(body));
+      })
+      .catch(() => stage.replaceWith(el("p", { class: "hint" }, "This browser cannot draw in 3D, or the view could not be loaded.")));
   }
   return () => {
     over = true;
@@ -275,27 +280,13 @@ function figuresTable(properties: Feature["properties"], decisions: Decision[]):
 }
 
 function formsTable(properties: Feature["properties"], decisions: Decision[] | null): HTMLElement {
-  if (decisions === null) {
-    return el("section", {}, el("h2", {}, "The forms that were tried"), el("p", { class: "hint" }, "This job was made by a version that recorded none."));
+  const caption = "The forms that were tried";
+  const rows = formRows(decisions ?? [], properties);
+  if (rows.length === 0) {
+    const words = decisions === null ? "This job was made by a version that recorded none." : "None was tried.";
+    return el("section", {}, el("h2", {}, caption), el("p", { class: "hint" }, words));
   }
-  type FormRow = ReturnType<typeof formRows>[number];
-  const rows: FormRow[] = formRows(decisions, properties);
-  if (rows.length === 0) return el("section", {}, el("h2", {}, "The forms that were tried"), el("p", { class: "hint" }, "None was tried."));
-  const columns: [string, (row: FormRow) => string][] = [
-    ["Form", (row) => row.form],
-    ["Outcome", (row) => row.outcome],
-    ["Faces", (row) => row.faces],
-    ["Planes", (row) => row.planes],
-    ["Points explained", (row) => row.explained],
-    ["RMSE", (row) => row.rmse],
-    [LEAD, (row) => row.margin],
-    ["Notes", (row) => row.detail],
-  ];
-  const filled = columns.filter(([, show]) => rows.some((row) => !["", "–"].includes(show(row))));
-  return table(
-    "The forms that were tried",
-    filled.map(([head]) => head),
-    rows.map((row) => filled.map(([, show]) => show(row))),
-    (i) => (rows[i].chosen ? "dossier-chosen" : null),
-  );
+  const filled = Object.keys(rows[0].cells).filter((head) => rows.some(({ cells }) => !["", "–"].includes(cells[head])));
+  const cells = rows.map((row) => filled.map((head) => row.cells[head]));
+  return table(caption, filled, cells, (i) => (rows[i].chosen ? "dossier-chosen" : null));
 }

@@ -1,7 +1,7 @@
 /** The drawings of a dossier as SVG: plan, section across the ridge, residuals. Lengths are metres, without exaggeration. */
 
 import { CYCLE } from "../models/colouring";
-import type { Point } from "../models/rings";
+import { boxAround, type Point } from "../models/plan";
 import { svg } from "../page/elements";
 import { NONE, residualNumber, RESIDUALS } from "../points/points_colouring";
 import { count, measure } from "../words/numbers";
@@ -34,7 +34,7 @@ interface Frame {
 }
 
 /** A frame with the same scale on both axes. */
-function frameOf(low: readonly [number, number], high: readonly [number, number]): Frame {
+function frameOf(low: Point, high: Point): Frame {
   const [w, h] = [Math.max(high[0] - low[0], 1), Math.max(high[1] - low[1], 1)];
   const scale = Math.min((WIDTH - MARGIN.left - MARGIN.right) / w, (MAX_HEIGHT - MARGIN.top - MARGIN.bottom) / h);
   const width = w * scale + MARGIN.left + MARGIN.right;
@@ -92,7 +92,7 @@ function ticks(from: number, to: number, step: number): number[] {
   return found;
 }
 
-function line(frame: Frame, name: string, from: readonly [number, number], to: readonly [number, number]): SVGElement {
+function line(frame: Frame, name: string, from: Point, to: Point): SVGElement {
   const [x1, y1, x2, y2] = [frame.x(from[0]), frame.y(from[1]), frame.x(to[0]), frame.y(to[1])].map((v) => v.toFixed(1));
   return svg("line", { class: name, x1, y1, x2, y2 });
 }
@@ -114,10 +114,9 @@ export function planDrawing(
 ): SVGElement {
   const corners = [...outline.flat(), ...edges.flatMap(({ from, to }) => [from, to])];
   if (points !== null) for (let i = 0; 3 * i < points.xyz.length; i++) corners.push([points.xyz[3 * i], points.xyz[3 * i + 1]]);
-  const bound = (axis: 0 | 1, pick: (a: number, b: number) => number): number =>
-    corners.reduce((best, corner) => pick(best, corner[axis]), corners[0]?.[axis] ?? 0);
-  const low: [number, number] = [bound(0, Math.min) - 1, bound(1, Math.min) - 1];
-  const high: [number, number] = [bound(0, Math.max) + 1, bound(1, Math.max) + 1];
+  const [west, south, east, north] = boxAround(corners);
+  const low: Point = [west - 1, south - 1];
+  const high: Point = [east + 1, north + 1];
   const frame = frameOf(low, high);
   const path = outline
     .map((ring) => `M${ring.map(([x, y]) => `${frame.x(x).toFixed(1)} ${frame.y(y).toFixed(1)}`).join("L")}Z`)
@@ -132,7 +131,7 @@ export function planDrawing(
   }
   children.push(svg("path", { class: "outline", d: path }));
   if (section !== null) children.push(...sectionMark(frame, section, low, high));
-  children.push(...scaleBar(frame), ...north());
+  children.push(...scaleBar(frame), ...northArrow());
   return drawing(frame, "The building from above, north up", ...children);
 }
 
@@ -150,7 +149,7 @@ function dotRadius(n: number): number {
 }
 
 /** The line of the section, as far as the drawing goes, with its ends named. */
-function sectionMark(frame: Frame, { at, along }: Section, low: readonly [number, number], high: readonly [number, number]): SVGElement[] {
+function sectionMark(frame: Frame, { at, along }: Section, low: Point, high: Point): SVGElement[] {
   const reach = [-1, 1].map((side) => {
     let far = Infinity;
     for (const axis of [0, 1] as const) {
@@ -175,38 +174,34 @@ function scaleBar(frame: Frame): SVGElement[] {
   return [svg("path", { class: "scale-bar", d }), label(x + metres * frame.scale + 8, y, measure(metres, metres < 1 ? 1 : 0, "m"), "start")];
 }
 
-function north(): SVGElement[] {
+function northArrow(): SVGElement[] {
   const [x, y] = [16, 26];
   return [svg("path", { class: "north", d: `M${x} ${y + 14}V${y - 8}M${x - 4} ${y - 1}L${x} ${y - 10}L${x + 4} ${y - 1}` }), label(x, y + 28, "N")];
 }
 
-/** The section: the model's profile, the floor and the points of the strip. Elevations are above the floor. */
+/** The section: the model's profile, the floor at 0 and the points of the strip. */
 export function sectionDrawing(
   model: Model,
   section: Section,
-  floorZ: number,
   points: Points | null,
   halfWidthM: number,
   colouring: Colouring,
 ): SVGElement {
   const cuts = cutModel(model, section);
   const near = points === null ? [] : strip(points, section, halfWidthM);
-  const ends = cuts.flatMap(({ from, to }) => [from, to]);
-  const ts = [...ends.map(([t]) => t), ...near.map(({ t }) => t)];
-  const zs = [...ends.map(([, z]) => z), ...near.map(({ z }) => z), floorZ];
-  const extreme = (values: number[], pick: (a: number, b: number) => number): number => values.reduce((a, b) => pick(a, b), values[0] ?? 0);
-  const left = extreme(ts, Math.min);
-  const low: [number, number] = [left - 1, extreme(zs, Math.min) - 0.5];
-  const high: [number, number] = [extreme(ts, Math.max) + 1, extreme(zs, Math.max) + 1];
+  const places = [...cuts.flatMap(({ from, to }) => [from, to]), ...near.map(({ t, z }): Point => [t, z])];
+  const [left, lowest, right, highest] = boxAround(places);
+  const low: Point = [left - 1, Math.min(lowest, 0) - 0.5];
+  const high: Point = [right + 1, Math.max(highest, 0) + 1];
   const frame = frameOf(low, high);
   const children: SVGElement[] = [];
   for (const t of ticks(0, high[0] - left, tickStep(high[0] - low[0], 10))) {
     children.push(line(frame, "grid", [left + t, low[1]], [left + t, high[1]]), label(frame.x(left + t), frame.height - MARGIN.bottom + 15, measure(t, t % 1 === 0 ? 0 : 1)));
   }
-  for (const z of ticks(low[1] - floorZ, high[1] - floorZ, tickStep(high[1] - low[1], 7))) {
-    children.push(line(frame, "grid", [low[0], floorZ + z], [high[0], floorZ + z]), label(MARGIN.left - 6, frame.y(floorZ + z) + 4, measure(z, z % 1 === 0 ? 0 : 1), "end"));
+  for (const z of ticks(low[1], high[1], tickStep(high[1] - low[1], 7))) {
+    children.push(line(frame, "grid", [low[0], z], [high[0], z]), label(MARGIN.left - 6, frame.y(z) + 4, measure(z, z % 1 === 0 ? 0 : 1), "end"));
   }
-  children.push(line(frame, "floor", [low[0], floorZ], [high[0], floorZ]));
+  children.push(line(frame, "floor", [low[0], 0], [high[0], 0]));
   const kinds: Cut["kind"][] = ["ground", "wall", "roof"];
   const profile = kinds.flatMap((kind) => cuts.filter((cut) => cut.kind === kind).map(({ from, to }) => line(frame, `cut cut-${kind}`, from, to)));
   const shown = near.filter((_, k) => k % Math.max(1, Math.ceil(near.length / MAX_DOTS)) === 0);

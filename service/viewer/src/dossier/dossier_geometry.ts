@@ -1,8 +1,10 @@
 /** What the drawings of a dossier show: edges of the roof, the line of the section, the model and the points along it. */
 
-import { inScene, type SceneFrame } from "../models/building_mesh";
+import { inScene, originInMetres, type SceneFrame } from "../models/building_mesh";
 import type { Building, Face } from "../models/cityjson";
+import { areaOf, type Point } from "../models/plan";
 import { ringNormal, type Normal } from "../models/triangulation";
+import { NO_PLANE, NO_RESIDUAL, readNodes, RESIDUAL_SHIFT } from "../points/points_glb";
 
 export type Xyz = readonly [number, number, number];
 
@@ -23,8 +25,8 @@ export interface RoofEdge {
 
 /** A vertical plane through the building: `t` metres along `along` from `at`. */
 export interface Section {
-  at: readonly [number, number];
-  along: readonly [number, number];
+  at: Point;
+  along: Point;
   /** Words for the caption. */
   through: string;
 }
@@ -32,8 +34,8 @@ export interface Section {
 /** A piece of the model in a section. */
 export interface Cut {
   kind: Face["kind"];
-  from: readonly [number, number];
-  to: readonly [number, number];
+  from: Point;
+  to: Point;
 }
 
 /** The points of a building: x, y, z in metres around the frame's origin, with the model's answer to each. */
@@ -116,25 +118,15 @@ export function sectionOf(model: Model, edges: readonly RoofEdge[]): Section | n
   return { at: largest.middle, along: eastward(along), through: flat ? "along the largest face" : "down the largest face" };
 }
 
-function measured(model: Model, face: Face): { area: number; normal: Normal; middle: readonly [number, number] } {
-  const ring = (face.rings[0] ?? []).map((index) => vertex(model, index));
-  const [ox, oy] = ring[0] ?? [0, 0];
-  let area = 0;
-  let mx = 0;
-  let my = 0;
-  ring.forEach(([x0, y0], i) => {
-    const [x1, y1] = ring[(i + 1) % ring.length];
-    const cross = (x0 - ox) * (y1 - oy) - (x1 - ox) * (y0 - oy);
-    area += cross / 2;
-    mx += ((x0 + x1 - 2 * ox) * cross) / 6;
-    my += ((y0 + y1 - 2 * oy) * cross) / 6;
-  });
-  const middle = area === 0 ? ([ox, oy] as const) : ([ox + mx / area, oy + my / area] as const);
-  return { area: Math.abs(area), normal: ringNormal(model.vertices, face.rings[0] ?? []), middle };
+function measured(model: Model, face: Face): { area: number; normal: Normal; middle: Point } {
+  const outer = face.rings[0] ?? [];
+  const ring = outer.map((index) => vertex(model, index)).map(([x, y]): Point => [x, y]);
+  const mean = (axis: 0 | 1): number => ring.reduce((sum, place) => sum + place[axis], 0) / ring.length;
+  return { area: Math.abs(areaOf(ring)), normal: ringNormal(model.vertices, outer), middle: [mean(0), mean(1)] };
 }
 
-function longestSide(edges: readonly RoofEdge[]): readonly [number, number] {
-  let best: readonly [number, number] = [1, 0];
+function longestSide(edges: readonly RoofEdge[]): Point {
+  let best: Point = [1, 0];
   let longest = 0;
   for (const { from, to } of edges) {
     const side = [to[0] - from[0], to[1] - from[1]] as const;
@@ -143,13 +135,13 @@ function longestSide(edges: readonly RoofEdge[]): readonly [number, number] {
   return best;
 }
 
-function unit([x, y]: readonly [number, number]): readonly [number, number] {
+function unit([x, y]: Point): Point {
   const length = Math.hypot(x, y);
   return length === 0 ? [1, 0] : [x / length, y / length];
 }
 
 /** So that east, or north, is to the right. */
-function eastward([x, y]: readonly [number, number]): readonly [number, number] {
+function eastward([x, y]: Point): Point {
   return x < -1e-9 || (Math.abs(x) <= 1e-9 && y < 0) ? [-x, -y] : [x, y];
 }
 
@@ -176,6 +168,29 @@ export function cutModel(model: Model, { at, along }: Section): Cut[] {
   return cuts;
 }
 
+/**
+ * The points of one building, from all nodes of the binary glTF of the service.
+ *
+ * @throws Error if the file is damaged or of another kind.
+ */
+export function pointsIn(file: ArrayBuffer, frame: SceneFrame): Points {
+  const { nodes, originM } = readNodes(file);
+  const origin = originInMetres(frame);
+  const [east, north, up] = originM.map((value, axis) => value - origin[axis]);
+  const n = nodes.reduce((sum, { count }) => sum + count, 0);
+  const points: Points = { xyz: new Float64Array(3 * n), residuals: new Float64Array(n).fill(NaN), planes: new Int32Array(n).fill(-1) };
+  let i = 0;
+  for (const { count, places, labels, step, translation } of nodes) {
+    for (let k = 0; k < count; k++, i++) {
+      const [x, y, z] = translation.map((start, axis) => start + step * places[4 * k + axis]);
+      points.xyz.set([x + east, -z + north, y + up], 3 * i);
+      if (labels[2 * k] !== NO_PLANE) points.planes[i] = labels[2 * k];
+      if (labels[2 * k + 1] !== NO_RESIDUAL) points.residuals[i] = (labels[2 * k + 1] - RESIDUAL_SHIFT) / 1000;
+    }
+  }
+  return points;
+}
+
 /** The points of a strip along the section: their indices and (t, z). */
 export function strip(points: Points, { at, along }: Section, halfWidthM: number): { index: number; t: number; z: number }[] {
   const found = [];
@@ -193,23 +208,13 @@ export function stripWidth(points: Points, section: Section): number {
   return [0.5, 1, 2].find((halfWidthM) => strip(points, section, halfWidthM).length >= 60) ?? 2;
 }
 
-export interface Histogram {
-  /** Width of a bin, metres. */
-  binM: number;
-  /** Counts from `-reachM` upward; residuals beyond are counted apart. */
-  counts: number[];
-  reachM: number;
-  below: number;
-  above: number;
-  /** Points with a roof. */
-  total: number;
-  /** Points without. */
-  uncovered: number;
-}
-
-export function histogram(residuals: Float64Array, binM = 0.05, reachM = 0.6): Histogram {
+/**
+ * The residuals in bins of `binM` metres from `-reachM` upward. Those beyond them (`below`, `above`) and points without a
+ * roof (`uncovered`) are counted apart; `total` are those with one.
+ */
+export function histogram(residuals: Float64Array, binM = 0.05, reachM = 0.6) {
   const counts = new Array<number>(Math.round((2 * reachM) / binM)).fill(0);
-  const found: Histogram = { binM, counts, reachM, below: 0, above: 0, total: 0, uncovered: 0 };
+  const found = { binM, counts, reachM, below: 0, above: 0, total: 0, uncovered: 0 };
   for (const residual of residuals) {
     if (Number.isNaN(residual)) {
       found.uncovered++;

@@ -1,5 +1,6 @@
 /** The way to a building's dossier: its address opens it, and any other address closes it. The rest is loaded then. */
 
+import type { Run } from "../api/requests";
 import { placeOf } from "../page/address";
 import { el } from "../page/elements";
 
@@ -25,7 +26,7 @@ export function dossierLink(): HTMLElement {
 }
 
 /** Open and close the dossier of a building as the address says, until the signal is aborted. */
-export function followDossier(jobPath: string, method: string | null, buildingId: string, signal: AbortSignal): void {
+export function followDossier(run: Run, buildingId: string, signal: AbortSignal): void {
   let close: (() => void) | null = null;
   const isWanted = (): boolean =>
     !signal.aborted && isDossier(location.hash) && placeOf(location.hash)?.building === buildingId;
@@ -40,7 +41,7 @@ export function followDossier(jobPath: string, method: string | null, buildingId
       return;
     }
     void import("./dossier").then(({ openDossier }) => {
-      if (isWanted() && close === null) close = openDossier(jobPath, method, buildingId, closed);
+      if (isWanted() && close === null) close = openDossier(run, buildingId, closed);
     });
   };
   window.addEventListener("hashchange", follow, { signal });

@@ -31,7 +31,7 @@ const CONFIDENCE = 0.9;
 const FOOTPRINT_SHARE = 0.98;
 
 /** The name of `bic_margin` in both tables. */
-export const LEAD = "Lead over the next form";
+const LEAD = "Lead over the next form";
 
 /** The figures that say how far the model can be trusted, those that are known. */
 export function trustFigures(properties: Properties): Figure[] {
@@ -195,27 +195,24 @@ const OUTCOMES: Record<string, string> = {
   missed: "not met",
 };
 
-/** The forms and levels of detail that were tried, one row each, in their order. */
-export function formRows(
-  decisions: readonly Decision[],
-  properties: Properties,
-): { form: string; outcome: string; chosen: boolean; faces: string; planes: string; explained: string; rmse: string; margin: string; detail: string }[] {
+/** The forms and levels of detail that were tried, in their order: the figures of each by their heads. */
+export function formRows(decisions: readonly Decision[], properties: Properties): { chosen: boolean; cells: Record<string, string> }[] {
   const delivered = decisions.filter(({ kind, outcome }) => kind === "form" && outcome === "chosen").at(-1);
   return decisions
     .filter(({ kind }) => kind !== "check")
     .map((entry) => {
-      const codes = entry.validity_codes ?? [];
-      const details = [entry.detail, codes.length > 0 ? `codes ${codes.join(", ")}` : ""].filter((part) => part !== "");
-      return {
-        form: entry.kind === "level" ? `LoD${entry.name}` : (FORMS[entry.name] ?? entry.name),
-        outcome: entry.kind === "level" && entry.outcome === "chosen" ? "made" : (OUTCOMES[entry.outcome] ?? entry.outcome),
-        chosen: entry.outcome === "chosen",
-        faces: entry.n_faces === undefined ? "–" : String(entry.n_faces),
-        planes: entry.n_planes === undefined ? "–" : String(entry.n_planes),
-        explained: entry.explained_share === undefined ? "–" : percent(entry.explained_share),
-        rmse: entry === delivered ? measure(properties["rmse_m"], 3, "m") : "–",
-        margin: entry.bic_margin === undefined ? "–" : measure(entry.bic_margin, 1),
-        detail: details.join("; "),
+      const { kind, name, outcome, detail, validity_codes: codes = [] } = entry;
+      const isLevel = kind === "level";
+      const cells = {
+        Form: isLevel ? `LoD${name}` : (FORMS[name] ?? name),
+        Outcome: isLevel && outcome === "chosen" ? "made" : (OUTCOMES[outcome] ?? outcome),
+        Faces: String(entry.n_faces ?? "–"),
+        Planes: String(entry.n_planes ?? "–"),
+        "Points explained": entry.explained_share === undefined ? "–" : percent(entry.explained_share),
+        RMSE: entry === delivered ? measure(properties["rmse_m"], 3, "m") : "–",
+        [LEAD]: measure(entry.bic_margin, 1),
+        Notes: [detail, codes.length > 0 ? `codes ${codes.join(", ")}` : ""].filter(Boolean).join("; "),
       };
+      return { chosen: outcome === "chosen", cells };
     });
 }

@@ -6,58 +6,55 @@ import { actionMenu, type Item } from "../page/action_menu";
 import { hashOf } from "../page/address";
 import { ask } from "../page/dialogs";
 import { announce } from "../page/notices";
-import type { Hooks } from "../page/view";
-import { MODELLED, titleOf } from "./job_words";
+import { jobsChanged } from "../page/view";
+import { hasModels, titleOf } from "./job_words";
 
 /** A menu of all of it. */
-export function jobMenu(job: StatusInfo, hooks: Hooks): HTMLElement {
+export function jobMenu(job: StatusInfo): HTMLElement {
   let now = job;
   const items = (): Item[] => {
     const over = isOver(now.status);
-    const keeping = {
-      label: now.keep === true ? "No longer keep it" : "Keep it",
-      act: async () => {
-        now = await keep(now, hooks);
-      },
+    const keeping = async (): Promise<void> => {
+      now = await keep(now);
     };
     return [
-      ...(over ? [{ label: "Try again…", act: () => retry(now, hooks) }] : []),
-      keeping,
+      ...(over ? [{ label: "Try again…", act: () => retry(now) }] : []),
+      { label: now.keep === true ? "No longer keep it" : "Keep it", act: keeping },
       ...comparing(now),
       { label: "Repeat on a schedule…", href: hashOf(["schedules", "new"], { job: now.jobID }) },
       { label: "Messages about it", href: hashOf(["webhooks"], { job: now.jobID }) },
       over
-        ? { label: "Remove…", act: () => removal(now, hooks) }
-        : { label: "Cancel…", act: () => cancellation(now, hooks) },
+        ? { label: "Remove…", act: () => removal(now) }
+        : { label: "Cancel…", act: () => cancellation(now) },
     ];
   };
-  return actionMenu(titleOf(job), items, hooks.onProblem);
+  return actionMenu(titleOf(job), items);
 }
 
 /** The way to the models of two runs side by side, of those of a comparison or of another job. */
 function comparing(job: StatusInfo): Item[] {
-  if (job.status !== "successful" || !MODELLED.has(job.processID ?? "reconstruct")) return [];
+  if (job.status !== "successful" || !hasModels(job)) return [];
   const [oldMethod = "", newMethod = ""] = Object.keys(job.summary?.runs ?? {});
   if (newMethod === "") return [{ label: "Compare with another…", href: hashOf(["changes"], { old: job.jobID }) }];
   return [{ label: "Two methods in 3D", href: hashOf(["changes"], { old: job.jobID, oldMethod, new: job.jobID, newMethod }) }];
 }
 
 /** Ask for changes, then start a new job; the page goes to it. */
-export async function retry(job: StatusInfo, hooks: Hooks): Promise<void> {
+export async function retry(job: StatusInfo): Promise<void> {
   const { openRetry } = await import("./retry_form").catch(() => {
     throw unreachable();
   });
   // lists leave the request out
   const whole = job.request === undefined ? await getJson<StatusInfo>(pathOfJob(job.jobID)) : job;
-  await openRetry(whole, hooks);
+  await openRetry(whole);
 }
 
 /** Keep a job whatever its age and size, or no longer; returns it as it is now. */
-async function keep(job: StatusInfo, hooks: Hooks): Promise<StatusInfo> {
+async function keep(job: StatusInfo): Promise<StatusInfo> {
   const response = await sendJson("PATCH", pathOfJob(job.jobID), { keep: job.keep !== true });
   const now = (await response.json()) as StatusInfo;
   announce(now.keep === true ? "The job is kept." : "The job is no longer kept.");
-  hooks.onChange();
+  jobsChanged();
   return { ...job, ...now };
 }
 
@@ -67,36 +64,30 @@ async function keep(job: StatusInfo, hooks: Hooks): Promise<StatusInfo> {
  * The service says whether it waits, runs or is over: what the page shows may be older. Of a job that is over the same
  * request would remove the results.
  */
-export async function cancellation(job: StatusInfo, hooks: Hooks): Promise<void> {
+export async function cancellation(job: StatusInfo): Promise<void> {
   const look = async (): Promise<Status> => (await getJson<StatusInfo>(pathOfJob(job.jobID))).status;
   const stop = async (status: Status): Promise<void> => {
     if (!isOver(status)) await request(pathOfJob(job.jobID), { method: "DELETE" });
     announce(isOver(status) ? "The job is over already." : "The job is cancelled.");
-    hooks.onChange();
+    jobsChanged();
   };
   const status = await look();
   if (status !== "running") return stop(status);
-  ask({
-    title: "Cancel the job?",
-    text: `“${titleOf(job)}” is running. What it has done so far is lost.`,
-    yes: "Cancel the job",
+  ask("Cancel the job?", `“${titleOf(job)}” is running. What it has done so far is lost.`, {
+    send: "Cancel the job",
     act: async () => stop(await look()), // it may have ended before the answer
-    onProblem: hooks.onProblem,
   });
 }
 
 /** Ask, then remove a job with its results; the page leaves it if it shows it. */
-function removal(job: StatusInfo, hooks: Hooks): void {
-  ask({
-    title: "Remove the job?",
-    text: `“${titleOf(job)}” and its results are removed from the service. Files that you have downloaded stay.`,
-    yes: "Remove it",
+function removal(job: StatusInfo): void {
+  ask("Remove the job?", `“${titleOf(job)}” and its results are removed from the service. Files that you have downloaded stay.`, {
+    send: "Remove it",
     act: async () => {
       await request(pathOfJob(job.jobID), { method: "DELETE" });
       announce("The job is removed.");
-      hooks.onChange();
+      jobsChanged();
       if (location.hash.startsWith(hashOf(["jobs", job.jobID]))) location.hash = "#/jobs";
     },
-    onProblem: hooks.onProblem,
   });
 }

@@ -1,54 +1,29 @@
-import { getJson, isOver, pathOfJob, type Problem } from "../api/requests";
+import { getJson, isOver, pathOfJob } from "../api/requests";
 import type { StatusInfo } from "../api/types";
 import { hashOf } from "../page/address";
-import { el } from "../page/elements";
-import { asProblem, problemNotice } from "../page/notices";
-import { ago } from "../words/numbers";
+import { el, refill } from "../page/elements";
+import { chip } from "../page/tables";
+import { JOBS_CHANGED } from "../page/view";
+import { Watching } from "../page/watching";
 import { pageLink } from "./downloads";
-import { statusWords, titleOf } from "./job_words";
+import { statusWords, titleOf, whenWords } from "./job_words";
 
 const SHOWN = 20;
 const REFRESH_MS = 4000;
 
 /** The jobs, newest first; reloaded while one of them is under way. */
-export class JobList {
+export class JobList extends Watching {
   private jobs: StatusInfo[] = [];
   private current = "";
-  private timer: number | undefined;
   private readonly list = el("ul", { class: "jobs" });
-  private readonly note = el("div");
+  private readonly none = el("p", { class: "hint", hidden: true }, "None yet. Jobs stay here after a reload.");
   private readonly all = el("a", { class: "all-jobs", href: "#/jobs", hidden: true }, "All jobs");
 
-  constructor(
-    place: HTMLElement,
-    private readonly onProblem: (problem: Problem) => void,
-  ) {
-    place.replaceChildren(el("h2", { id: "jobs-title" }, "Jobs"), this.note, this.list, this.all);
-  }
-
-  async start(): Promise<void> {
-    await this.refresh();
-  }
-
-  async refresh(): Promise<void> {
-    clearTimeout(this.timer);
-    try {
-      const answer = await getJson<{ jobs: StatusInfo[] }>(`jobs?limit=${SHOWN}`);
-      this.jobs = answer.jobs;
-      this.note.replaceChildren(
-        this.jobs.length === 0 ? el("p", { class: "hint" }, "None yet. Jobs stay here after a reload.") : "",
-      );
-      this.all.hidden = this.jobs.length === 0;
-      this.draw();
-    } catch (error) {
-      const problem = asProblem(error);
-      this.note.replaceChildren(problemNotice(problem, () => void this.refresh()));
-      this.onProblem(problem);
-      return;
-    }
-    if (this.jobs.some((job) => !isOver(job.status))) {
-      this.timer = window.setTimeout(() => void this.refresh(), REFRESH_MS);
-    }
+  constructor(place: HTMLElement) {
+    super(REFRESH_MS);
+    document.addEventListener(JOBS_CHANGED, () => void this.load());
+    place.replaceChildren(el("h2", { id: "jobs-title" }, "Jobs"), this.note, this.none, this.list, this.all);
+    void this.load();
   }
 
   /** Show which job is open. */
@@ -57,27 +32,29 @@ export class JobList {
     this.draw();
   }
 
-  private draw(): void {
-    const now = new Date();
-    const focused = this.list.contains(document.activeElement) ? document.activeElement?.getAttribute("href") : null;
-    this.list.replaceChildren(...this.jobs.map((job) => el("li", {}, this.entry(job, now), pageOf(job))));
-    if (focused != null) this.list.querySelector<HTMLAnchorElement>(`a[href="${CSS.escape(focused)}"]`)?.focus();
+  protected async read(signal: AbortSignal): Promise<boolean> {
+    const { jobs } = await getJson<{ jobs: StatusInfo[] }>(`jobs?limit=${SHOWN}`, { signal });
+    if (signal.aborted) return false;
+    this.jobs = jobs;
+    this.none.hidden = jobs.length > 0;
+    this.all.hidden = jobs.length === 0;
+    this.draw();
+    return jobs.some(({ status }) => !isOver(status));
   }
 
-  private entry(job: StatusInfo, now: Date): HTMLElement {
+  private draw(): void {
+    refill(this.list, ...this.jobs.map((job) => el("li", {}, this.entry(job), pageOf(job))));
+  }
+
+  private entry(job: StatusInfo): HTMLElement {
+    const { jobID, scheduleID } = job;
     return el(
       "a",
-      {
-        class: "job",
-        href: hashOf(["jobs", job.jobID]),
-        "aria-current": job.jobID === this.current ? "page" : null,
-      },
+      { class: "job", href: hashOf(["jobs", jobID]), "aria-current": jobID === this.current ? "page" : null },
       el("span", { class: "job-title" }, titleOf(job)),
-      el("span", { class: `chip chip-${job.status}` }, statusWords(job)),
-      el("span", { class: "job-when" }, job.created === undefined ? "" : ago(new Date(job.created), now)),
-      job.scheduleID === undefined
-        ? null
-        : el("span", { class: "job-schedule", title: `Of schedule ${job.scheduleID}` }, "scheduled"),
+      chip(job.status, statusWords(job)),
+      el("span", { class: "job-when" }, whenWords(job)),
+      scheduleID === undefined ? null : el("span", { class: "job-schedule", title: `Of schedule ${scheduleID}` }, "scheduled"),
     );
   }
 }

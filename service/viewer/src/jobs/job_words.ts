@@ -1,7 +1,7 @@
 /** Jobs in words. */
 
 import type { StatusInfo, Summary } from "../api/types";
-import { count, counted, duration } from "../words/numbers";
+import { ago, count, counted, duration } from "../words/numbers";
 
 export const STATUS_WORDS: Record<StatusInfo["status"], string> = {
   accepted: "waiting",
@@ -18,13 +18,17 @@ export const PROCESS_WORDS: Record<string, string> = {
   echo: "Echo",
 };
 
-/** Processes whose results have buildings. */
-export const MODELLED = new Set(["reconstruct", "compare"]);
+export const processWords = ({ processID = "reconstruct" }: { processID?: string }): string => PROCESS_WORDS[processID] ?? processID;
+
+const MODELLED = new Set(["reconstruct", "compare"]);
 
 /** The user's title of a job, otherwise the beginning of its id. */
 export function titleOf(job: StatusInfo): string {
   return job.title ?? `Job ${job.jobID.slice(0, 8)}`;
 }
+
+/** Whether a job has models to look at; others have files alone. */
+export const hasModels = ({ processID = "reconstruct" }: StatusInfo): boolean => MODELLED.has(processID);
 
 /** The status, with the progress of a job that runs. */
 export function statusWords(job: StatusInfo): string {
@@ -60,10 +64,15 @@ export function buildingWords(statuses: Record<string, number>): string {
 const total = (counts: Record<string, number>): number => Object.values(counts).reduce((sum, one) => sum + one, 0);
 
 /** How long a job has run up to now, or ran; empty if it never did. */
-export function durationWords({ started, finished }: StatusInfo, now: Date): string {
+export function durationWords({ started, finished }: StatusInfo): string {
   if (started === undefined) return "";
-  const end = finished === undefined ? now.getTime() : Date.parse(finished);
+  const end = finished === undefined ? Date.now() : Date.parse(finished);
   return duration((end - Date.parse(started)) / 1000);
+}
+
+/** How long ago it was created; empty if that is unknown. */
+export function whenWords({ created }: StatusInfo): string {
+  return created === undefined ? "" : ago(created);
 }
 
 const REMEDIES: Record<string, string> = {

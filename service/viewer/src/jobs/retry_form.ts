@@ -2,9 +2,9 @@ import { getJson, pathOfJob, sendJson } from "../api/requests";
 import type { InputDescription, StatusInfo } from "../api/types";
 import { openForm } from "../page/dialogs";
 import { el } from "../page/elements";
-import { Boxes, choice } from "../page/form_fields";
+import { Boxes, controlOf, field } from "../page/form_fields";
 import { announce } from "../page/notices";
-import type { Hooks } from "../page/view";
+import { jobsChanged } from "../page/view";
 import { titleOf } from "./job_words";
 import { changes, flat } from "./settings_changes";
 import { SettingsEditor } from "./settings_editor";
@@ -24,7 +24,7 @@ interface Field {
 }
 
 /** Open the form that starts a job again, with changes. The inputs are those that the process describes. */
-export async function openRetry(job: StatusInfo, hooks: Hooks): Promise<void> {
+export async function openRetry(job: StatusInfo): Promise<void> {
   const process = job.processID ?? "reconstruct";
   const { inputs } = await getJson<{ inputs: Record<string, InputDescription> }>(`processes/${encodeURIComponent(process)}`);
   const before = job.request?.inputs ?? {};
@@ -39,8 +39,7 @@ export async function openRetry(job: StatusInfo, hooks: Hooks): Promise<void> {
   const [first, more] = [true, false].map((isFirst) =>
     fields.filter(({ name }) => FIRST.includes(name) === isFirst).map(({ element }) => element),
   );
-  openForm({
-    title: "Try again",
+  openForm("Try again", {
     content: [
       el("p", {}, `A new job with the files of “${titleOf(job)}”. What you do not change stays as it was.`),
       ...(first ?? []),
@@ -59,10 +58,9 @@ export async function openRetry(job: StatusInfo, hooks: Hooks): Promise<void> {
       const response = await sendJson("POST", `${pathOfJob(job.jobID)}/retry`, { inputs: given });
       const { jobID } = (await response.json()) as StatusInfo;
       announce("The new job is submitted.");
-      hooks.onChange();
+      jobsChanged();
       location.hash = `#/jobs/${jobID}`;
     },
-    onProblem: hooks.onProblem,
   });
 }
 
@@ -80,12 +78,8 @@ function fieldOf(name: string, { title, description, schema }: InputDescription,
   }
   const text = given ?? schema.default ?? "";
   const shown = Array.isArray(text) ? text.join(", ") : String(text);
-  const control =
-    schema.enum === undefined
-      ? el("input", { type: "text", id, value: shown, autocomplete: "off", "aria-describedby": hint.id })
-      : choice(id, { ...(schema.default == null ? { "": "as in the file" } : {}), ...Object.fromEntries(schema.enum.map((word) => [word, word])) }, shown);
-  control.setAttribute("aria-describedby", hint.id);
-  const element = el("div", { class: "field" }, el("label", { for: id }, label), control, hint);
+  const control = controlOf(schema, id, shown, schema.default == null ? { "": "as in the file" } : {});
+  const element = field(label, control, description ?? "");
   const value = (typed: string): unknown => {
     if (name === "bbox") return typed.split(",").map(Number);
     return schema.type === "number" && Number.isFinite(Number(typed)) ? Number(typed) : typed;

@@ -1,5 +1,6 @@
 import type { SettingSchema } from "../api/types";
-import { el } from "../page/elements";
+import { button, el } from "../page/elements";
+import { controlOf } from "../page/form_fields";
 import { announce } from "../page/notices";
 import { known, rangeWords, textOf, valueOf, type Flat } from "./settings_changes";
 import "./settings_editor.css";
@@ -26,8 +27,6 @@ export class SettingsEditor {
     this.known = known(schema);
     for (const name of elsewhere) this.known.delete(name);
     for (const [name, value] of before) this.add(name, textOf(value));
-    const add = el("button", { type: "button" }, "Add");
-    add.addEventListener("click", () => this.addNamed());
     this.name.addEventListener("keydown", (event) => {
       if (event.key !== "Enter") return;
       event.preventDefault(); // it would send the form
@@ -42,7 +41,7 @@ export class SettingsEditor {
       el("legend", {}, "Settings"),
       this.list,
       el("label", { for: this.name.id, class: "setting-label" }, "Another setting"),
-      el("div", { class: "setting-add" }, this.name, add),
+      el("div", { class: "setting-add" }, this.name, button("Add", () => this.addNamed())),
       el("datalist", { id: "setting-names" }, ...[...this.known.keys()].map((value) => el("option", { value }))),
       this.note,
     );
@@ -70,24 +69,20 @@ export class SettingsEditor {
   private add(name: string, value: string): void {
     const schema = this.known.get(name) ?? {};
     const id = `setting-${name.replace(/\W/g, "-")}`;
-    const words = schema.enum ?? (schema.type === "boolean" ? ["true", "false"] : null);
-    const field =
-      words === null
-        ? el("input", { type: "text", id, value, autocomplete: "off", "aria-describedby": `${id}-hint` })
-        : el("select", { id, "aria-describedby": `${id}-hint` }, ...words.map((word) => el("option", { value: word, selected: word === value }, word)));
-    const remove = el("button", { type: "button", class: "icon", "aria-label": `Remove ${name}` }, "×");
-    const row = el(
-      "li",
-      {},
-      el("div", { class: "setting-head" }, el("label", { for: id }, name), remove),
-      field,
-      el("p", { class: "hint", id: `${id}-hint` }, [schema.description ?? "", rangeWords(schema)].filter((part) => part !== "").join(" ")),
-    );
-    remove.addEventListener("click", () => {
+    const field = controlOf(schema, id, value);
+    field.setAttribute("aria-describedby", `${id}-hint`);
+    const remove = (): void => {
       this.rows.delete(name);
       row.remove();
       this.name.focus();
-    });
+    };
+    const row = el(
+      "li",
+      {},
+      el("div", { class: "setting-head" }, el("label", { for: id }, name), button("×", remove, { class: "icon", "aria-label": `Remove ${name}` })),
+      field,
+      el("p", { class: "hint", id: `${id}-hint` }, [schema.description ?? "", rangeWords(schema)].filter((part) => part !== "").join(" ")),
+    );
     this.rows.set(name, field);
     this.list.append(row);
   }

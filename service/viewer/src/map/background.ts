@@ -1,10 +1,13 @@
 /** Tiles in Web Mercator beneath the outlines, if the operator of the service names some; they are bent to the map's plane. */
 
-import { getJson, ofRun } from "../api/requests";
+import { getJson, partOf } from "../api/requests";
 import type { Feature } from "../api/types";
-import { georeference, pairsOf, type Georeference, type Xy } from "./georeference";
+import type { Point } from "../models/plan";
+import type { RunObjects } from "../models/run_objects";
+import { measure } from "../words/numbers";
+import { georeference, pairsOf, type Georeference } from "./georeference";
 import type { MapView } from "./map_view";
-import type { Backdrop } from "./outline_map";
+import type { Backdrop, OutlineMap } from "./outline_map";
 
 const TILE_PX = 256;
 const SAMPLE = 60; // buildings whose outlines show where the plane lies on Earth; ids are random, so they lie anywhere
@@ -14,18 +17,25 @@ const ANCESTORS = 5; // levels that stand in for tiles that have not arrived
 const OVERLAP = 1 / TILE_PX; // of a tile, against seams
 
 /** What the operator set. */
-export interface TileSource {
+interface TileSource {
   /** https, with {z}, {x} and {y}. */
   template: string;
   credit: string;
   maxZoom: number;
 }
 
-/** The tiles that the page names; null if it names none. */
-export function tileSource(): TileSource | null {
+/** Lay the operator's tiles beneath the map of a run, if the results lie on Earth. */
+export async function layBackground(map: OutlineMap, run: RunObjects, signal: AbortSignal): Promise<void> {
   const given = (name: string): string => document.querySelector<HTMLMetaElement>(`meta[name="${name}"]`)?.content ?? "";
-  const template = given("map-tiles");
-  return template === "" ? null : { template, credit: given("map-credit"), maxZoom: Number(given("map-max-zoom")) };
+  const { report: { crs }, frame } = run;
+  const source: TileSource = { template: given("map-tiles"), credit: given("map-credit"), maxZoom: Number(given("map-max-zoom")) };
+  if (source.template === "" || (crs?.to_wgs84 ?? null) === null) return;
+  const { origin: [east, north], horizontalUnitM: unit } = frame;
+  const inPlane = ([x, y]: Point): Point => [(x - east) * unit, (y - north) * unit];
+  const place = await locate(run, inPlane, signal);
+  if (place === null) return;
+  const within = place.errorM < 0.5 ? "" : ` · placed to within ${measure(place.errorM, 1, "m")}`;
+  map.lay(new Background(source, place, map.request), `${source.credit}${within}`);
 }
 
 /**
@@ -34,21 +44,16 @@ export function tileSource(): TileSource | null {
  * @param inPlane From the coordinates of the tiles to the plane of the map.
  * @returns Null if the results have too few outlines.
  */
-export async function locate(
-  jobPath: string,
-  method: string | null,
-  inPlane: (place: Xy) => Xy,
-  signal: AbortSignal,
-): Promise<Georeference | null> {
+async function locate(run: RunObjects, inPlane: (place: Point) => Point, signal: AbortSignal): Promise<Georeference | null> {
   const page = async (crs: string): Promise<Feature[]> => {
-    const path = ofRun(`${jobPath}/buildings?limit=${SAMPLE}&crs=${crs}`, method);
+    const path = partOf(run, `buildings?limit=${SAMPLE}&crs=${crs}`);
     return (await getJson<{ features: Feature[] }>(path, { signal, headers: { Accept: "application/geo+json" } })).features;
   };
   const [native, degrees] = await Promise.all([page("native"), page("CRS84")]);
   return georeference(pairsOf(native, degrees, inPlane));
 }
 
-export class Background implements Backdrop {
+class Background implements Backdrop {
   private readonly tiles = new Map<string, HTMLImageElement>();
 
   /** @param onArrival A tile has arrived: draw again. */
@@ -61,7 +66,7 @@ export class Background implements Backdrop {
   draw(context: CanvasRenderingContext2D, view: MapView): void {
     const { toMercator } = this.place;
     const [west, south, east, north] = view.box();
-    const corners = ([[west, south], [east, south], [east, north], [west, north]] as Xy[]).map(toMercator);
+    const corners = ([[west, south], [east, south], [east, north], [west, north]] as Point[]).map(toMercator);
     const [middle, beside] = [toMercator([view.east, view.north]), toMercator([view.east + 1 / view.scale, view.north])];
     const perPixel = Math.hypot(beside[0] - middle[0], beside[1] - middle[1]);
     const sharp = Math.log2(Math.min(devicePixelRatio, 2));
@@ -83,7 +88,7 @@ export class Background implements Backdrop {
       const image = this.tiles.get(`${level - up}/${x >> up}/${y >> up}`);
       if (image === undefined || !image.complete || image.naturalWidth === 0) continue;
       const side = 2 ** level;
-      const corner = (dx: number, dy: number): Xy => {
+      const corner = (dx: number, dy: number): Point => {
         const [east, north] = this.place.toPlane([(x + dx) / side, (y + dy) / side]);
         return view.pixel(east, north);
       };

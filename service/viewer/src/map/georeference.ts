@@ -1,18 +1,17 @@
 /** From the plane of the map to Web Mercator and back, fitted to places that are known in both. */
 
 import type { Feature } from "../api/types";
-
-export type Xy = [number, number];
+import { areaOf, boxAround, polygonsOf, type Point } from "../models/plan";
 
 /** A place in metres around the scene's origin, and in Web Mercator: 0 to 1 from west to east and from north to south. */
 export interface Pair {
-  plane: Xy;
-  mercator: Xy;
+  plane: Point;
+  mercator: Point;
 }
 
 export interface Georeference {
-  toMercator: (place: Xy) => Xy;
-  toPlane: (place: Xy) => Xy;
+  toMercator: (place: Point) => Point;
+  toPlane: (place: Point) => Point;
   /** Largest distance in metres between a place and where the fit puts it. */
   errorM: number;
 }
@@ -20,7 +19,7 @@ export interface Georeference {
 const CURVED_M = 400; // below this extent a plane bends by less than 4 cm: three terms are enough
 
 /** Longitude and latitude in degrees as a place in Web Mercator. */
-export function mercatorOf([longitude, latitude]: readonly number[]): Xy {
+export function mercatorOf([longitude, latitude]: readonly number[]): Point {
   const sine = Math.sin((latitude * Math.PI) / 180);
   return [longitude / 360 + 0.5, 0.5 - Math.atanh(sine) / (2 * Math.PI)];
 }
@@ -30,7 +29,7 @@ export function mercatorOf([longitude, latitude]: readonly number[]): Xy {
  *
  * @param inPlane From the coordinates of the tiles to the plane of the map.
  */
-export function pairsOf(native: readonly Feature[], degrees: readonly Feature[], inPlane: (place: Xy) => Xy): Pair[] {
+export function pairsOf(native: readonly Feature[], degrees: readonly Feature[], inPlane: (place: Point) => Point): Pair[] {
   const others = new Map(degrees.map((feature) => [feature.id, feature]));
   return native.flatMap((feature) => {
     const [mine, theirs] = [outerRing(feature), outerRing(others.get(feature.id))];
@@ -42,22 +41,10 @@ export function pairsOf(native: readonly Feature[], degrees: readonly Feature[],
   });
 }
 
-/** The outer ring of an outline of one part, not closed; empty for any other. */
-function outerRing(feature: Feature | undefined): Xy[] {
-  const geometry = feature?.geometry;
-  if (geometry?.type === "Polygon") return (geometry.coordinates as Xy[][])[0].slice(0, -1);
-  if (geometry?.type === "MultiPolygon" && (geometry.coordinates as Xy[][][]).length === 1) {
-    return (geometry.coordinates as Xy[][][])[0][0].slice(0, -1);
-  }
-  return []; // the order of several parts may differ
-}
-
-function areaOf(ring: readonly Xy[]): number {
-  const [x, y] = ring[0];
-  return ring.reduce((sum, [ax, ay], i) => {
-    const [bx, by] = ring[(i + 1) % ring.length];
-    return sum + (ax - x) * (by - y) - (bx - x) * (ay - y);
-  }, 0);
+/** The outer ring of an outline of one part, not closed; empty for any other: the order of several parts may differ. */
+function outerRing(feature: Feature | undefined): readonly Point[] {
+  const [polygon, ...others] = polygonsOf(feature?.geometry);
+  return polygon === undefined || others.length > 0 ? [] : polygon[0].slice(0, -1);
 }
 
 /** Fit both directions; null if there are too few places, or all on one line. */
@@ -74,62 +61,55 @@ export function georeference(pairs: readonly Pair[]): Georeference | null {
   return { toMercator, toPlane, errorM: errors.reduce((a, b) => Math.max(a, b), 0) };
 }
 
-function extentOf(places: readonly Xy[]): number {
-  const spans = [0, 1].map((axis) => {
-    const values = places.map((place) => place[axis]);
-    return values.reduce((a, b) => Math.max(a, b), -Infinity) - values.reduce((a, b) => Math.min(a, b), Infinity);
-  });
-  return Math.max(...spans);
+function extentOf(places: readonly Point[]): number {
+  const [west, south, east, north] = boxAround(places);
+  return Math.max(east - west, north - south);
 }
 
 /** The polynomial of the first or second order that takes places to others with the least squares; null if there is none. */
-function fitted(from: readonly Xy[], to: readonly Xy[], curved: boolean): ((place: Xy) => Xy) | null {
+function fitted(from: readonly Point[], to: readonly Point[], curved: boolean): ((place: Point) => Point) | null {
   if (from.length < 3) return null;
   // around the middle and in a unit of the extent: the squares would lose digits otherwise
-  const middle: Xy = [mean(from, 0), mean(from, 1)];
+  const middle: Point = [mean(from, 0), mean(from, 1)];
   const unit = Math.max(extentOf(from), Number.MIN_VALUE);
-  const target: Xy = [mean(to, 0), mean(to, 1)];
-  const terms = ([x, y]: Xy): number[] => {
+  const target: Point = [mean(to, 0), mean(to, 1)];
+  const terms = ([x, y]: Point): number[] => {
     const [u, v] = [(x - middle[0]) / unit, (y - middle[1]) / unit];
     return curved ? [1, u, v, u * u, u * v, v * v] : [1, u, v];
   };
   const rows = from.map(terms);
-  const n = rows[0].length;
-  const normal = Array.from({ length: n }, (_, i) => Array.from({ length: n }, (__, j) => rows.reduce((sum, row) => sum + row[i] * row[j], 0)));
-  const both = [0, 1].map((axis) => {
-    const right = Array.from({ length: n }, (_, i) => rows.reduce((sum, row, k) => sum + row[i] * (to[k][axis] - target[axis]), 0));
-    return solved(normal, right);
+  const sums = rows[0].map((_, i) => {
+    const left = rows[0].map((__, j) => sum(rows.map((row) => row[i] * row[j])));
+    const right = ([0, 1] as const).map((axis) => sum(rows.map((row, k) => row[i] * (to[k][axis] - target[axis]))));
+    return [...left, ...right];
   });
-  const [first, second] = both;
-  if (first === null || second === null) return null;
+  const factors = solved(sums);
+  if (factors === null) return null;
   return (place) => {
     const found = terms(place);
-    return [
-      target[0] + found.reduce((sum, term, i) => sum + term * first[i], 0),
-      target[1] + found.reduce((sum, term, i) => sum + term * second[i], 0),
-    ];
+    const shifted = (axis: 0 | 1): number => target[axis] + sum(found.map((term, i) => term * factors[i][axis]));
+    return [shifted(0), shifted(1)];
   };
 }
 
-function mean(places: readonly Xy[], axis: 0 | 1): number {
-  return places.reduce((sum, place) => sum + place[axis], 0) / places.length;
-}
+const sum = (values: readonly number[]): number => values.reduce((a, b) => a + b, 0);
 
-/** Gaussian elimination with pivots; null if the matrix is singular. */
-function solved(matrix: readonly (readonly number[])[], right: readonly number[]): number[] | null {
-  const rows = matrix.map((row, i) => [...row, right[i]]);
+const mean = (places: readonly Point[], axis: 0 | 1): number => sum(places.map((place) => place[axis])) / places.length;
+
+/** Gaussian elimination with pivots, of a square matrix beside its right sides; null if it is singular. */
+function solved(rows: number[][]): number[][] | null {
   const n = rows.length;
-  const largest = Math.max(...matrix.flat().map(Math.abs));
+  const largest = Math.max(...rows.flatMap((row) => row.slice(0, n)).map(Math.abs));
   for (let column = 0; column < n; column++) {
     let pivot = column;
     for (let row = column + 1; row < n; row++) if (Math.abs(rows[row][column]) > Math.abs(rows[pivot][column])) pivot = row;
     if (Math.abs(rows[pivot][column]) < 1e-10 * largest) return null;
     [rows[column], rows[pivot]] = [rows[pivot], rows[column]];
-    for (let row = 0; row < n; row++) {
-      if (row === column) continue;
-      const factor = rows[row][column] / rows[column][column];
-      for (let k = column; k <= n; k++) rows[row][k] -= factor * rows[column][k];
+    for (const row of rows) {
+      if (row === rows[column]) continue;
+      const factor = row[column] / rows[column][column];
+      row.forEach((_, k) => (row[k] -= factor * rows[column][k]));
     }
   }
-  return rows.map((row, i) => row[n] / row[i]);
+  return rows.map((row, i) => row.slice(n).map((value) => value / row[i]));
 }

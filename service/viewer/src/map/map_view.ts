@@ -1,5 +1,4 @@
-/** x_min, y_min, x_max, y_max in metres. */
-export type Box = [number, number, number, number];
+import type { Box } from "../models/plan";
 
 const MOST_PX_PER_M = 120;
 const LEAST_PX_PER_M = 1e-4;

@@ -1,9 +1,11 @@
 /** The outlines in plan, north up, drawn on a canvas. It is independent of the service, of lists and of the 3D view. */
 
+import { MathUtils } from "three";
 import type { Outlines } from "../models/outlines";
-import { el } from "../page/elements";
+import { boxAround, united, type Box } from "../models/plan";
+import { el, onKeys } from "../page/elements";
 import { CATEGORIES, CATEGORY_NAMES, isFlat, type Category } from "../words/roof_types";
-import { MapView, scaleBar, type Box } from "./map_view";
+import { MapView, scaleBar } from "./map_view";
 import "./outline_map.css";
 
 const CELLS = 24; // paths per side of the map: those out of sight are not drawn
@@ -47,7 +49,7 @@ export class OutlineMap {
   });
   private readonly bar = el("div", { class: "map-scale" });
   private readonly credit = el("div", { class: "map-credit", hidden: true });
-  private readonly context: CanvasRenderingContext2D;
+  private readonly context = this.canvas.getContext("2d");
   private readonly shapes = new Map<string, Shape>();
   private only: ReadonlySet<string> | null = null;
   private colours: ColourOf = ({ category }) => CATEGORIES[category].colour;
@@ -64,14 +66,8 @@ export class OutlineMap {
   private readonly pointers = new Map<number, { x: number; y: number }>();
   private pressedAt: { x: number; y: number; alone: boolean } | null = null;
 
-  /**
-   * @param onPick Gets the object that was clicked, null for a click beside all of them.
-   * @throws Error if the browser has no canvas.
-   */
+  /** @param onPick Gets the object that was clicked, null for a click beside all of them. */
   constructor(private readonly onPick: (id: string | null) => void) {
-    const context = this.canvas.getContext("2d");
-    if (context === null) throw new Error("this browser cannot draw a map");
-    this.context = context;
     this.element = el("div", { class: "map" }, this.canvas, this.bar, this.credit);
     const { canvas } = this;
     canvas.addEventListener("pointerdown", (event) => this.pressed(event));
@@ -79,7 +75,17 @@ export class OutlineMap {
     canvas.addEventListener("pointerup", (event) => this.released(event));
     canvas.addEventListener("pointercancel", (event) => this.released(event));
     canvas.addEventListener("wheel", (event) => this.wheeled(event), { passive: false });
-    canvas.addEventListener("keydown", (event) => this.typed(event));
+    onKeys(canvas, {
+      ArrowLeft: () => this.pan(STEP_PX, 0),
+      ArrowRight: () => this.pan(-STEP_PX, 0),
+      ArrowUp: () => this.pan(0, STEP_PX),
+      ArrowDown: () => this.pan(0, -STEP_PX),
+      "+": () => this.zoom(1.4),
+      "=": () => this.zoom(1.4),
+      "-": () => this.zoom(1 / 1.4),
+      f: () => this.fit(),
+      Escape: () => onPick(null),
+    });
     this.dark.addEventListener("change", this.request);
     this.watch = new ResizeObserver(() => this.resize());
     this.watch.observe(this.element);
@@ -174,9 +180,10 @@ export class OutlineMap {
 
   private draw(now: number): void {
     this.frame = 0;
-    if (this.view.width === 0) return; // until the observer of its size has seen it
-    this.fly(now);
     const { context, view } = this;
+    // until the observer of its size has seen it
+    if (context === null || view.width === 0 || !this.element.isConnected) return;
+    this.fly(now);
     const began = performance.now();
     const ratio = this.canvas.width / Math.max(view.width, 1);
     context.setTransform(ratio, 0, 0, ratio, 0, 0);
@@ -186,16 +193,16 @@ export class OutlineMap {
     context.setTransform(ratio * a, 0, 0, ratio * d, ratio * e, ratio * f);
     const seen = view.box();
     this.cells ??= cellsOf(this.shown(), this.colours);
-    for (const cell of this.cells) if (meet(cell.box, seen)) this.paint(cell);
+    for (const cell of this.cells) if (meet(cell.box, seen)) this.paint(context, cell);
     const shape = this.selected === null ? undefined : this.shapes.get(this.selected);
-    if (shape !== undefined) this.mark(shape);
+    if (shape !== undefined) this.mark(context, shape);
     this.drawBar();
     Object.assign(this.canvas.dataset, { outlines: this.shown().length, frameMs: (performance.now() - began).toFixed(1) });
     if (this.flight !== null) this.request();
   }
 
-  private paint({ path, category, colour }: Cell): void {
-    const { context, view } = this;
+  private paint(context: CanvasRenderingContext2D, { path, category, colour }: Cell): void {
+    const { view } = this;
     const pixel = 1 / view.scale;
     context.fillStyle = context.strokeStyle = colour;
     context.globalAlpha = isFlat(category) ? 0.3 : 0.55;
@@ -207,10 +214,9 @@ export class OutlineMap {
     context.stroke(path);
   }
 
-  private mark(shape: Shape): void {
-    const { context, view } = this;
-    const path = new Path2D();
-    trace(path, shape.rings);
+  private mark(context: CanvasRenderingContext2D, shape: Shape): void {
+    const { view } = this;
+    const path = traced(shape.rings);
     context.fillStyle = this.colours(shape);
     context.globalAlpha = 0.7;
     context.fill(path);
@@ -246,9 +252,9 @@ export class OutlineMap {
   private fly(now: number): void {
     if (this.flight === null) return;
     const { from, start, end } = this.flight;
-    const share = Math.min(Math.max((now - from) / FLIGHT_MS, 0), 1);
-    this.view.between(start, end, share * share * (3 - 2 * share));
-    if (share === 1) this.flight = null;
+    const eased = MathUtils.smoothstep(now, from, from + FLIGHT_MS);
+    this.view.between(start, end, eased);
+    if (eased === 1) this.flight = null;
   }
 
   private zoom(factor: number, x = this.view.width / 2, y = this.view.height / 2): void {
@@ -314,36 +320,18 @@ export class OutlineMap {
     this.zoom(Math.exp(-0.0018 * Math.min(Math.max(pixels, -400), 400)), x, y);
   }
 
-  private typed(event: KeyboardEvent): void {
-    const action = (
-      {
-        ArrowLeft: () => this.pan(STEP_PX, 0),
-        ArrowRight: () => this.pan(-STEP_PX, 0),
-        ArrowUp: () => this.pan(0, STEP_PX),
-        ArrowDown: () => this.pan(0, -STEP_PX),
-        "+": () => this.zoom(1.4),
-        "=": () => this.zoom(1.4),
-        "-": () => this.zoom(1 / 1.4),
-        f: () => this.fit(),
-        Escape: () => this.onPick(null),
-      } as Record<string, () => void>
-    )[event.key];
-    if (action === undefined || event.ctrlKey || event.metaKey || event.altKey) return;
-    event.preventDefault();
-    action();
-  }
-
   /** The smallest object at a place of the map; a very small one also takes what is near it. */
   private under({ x, y }: { x: number; y: number }): string | null {
     const [east, north] = this.view.place(x, y);
     const near = NEAR_PX / this.view.scale;
+    const ratio = this.canvas.width / Math.max(this.view.width, 1);
     let best: { id: string; size: number } | null = null;
     for (const { id, rings, box } of this.shown()) {
       if (!meet(box, [east - near, north - near, east + near, north + near])) continue;
       const size = (box[2] - box[0]) * (box[3] - box[1]);
       if (size >= (best?.size ?? Infinity)) continue;
       const isSmall = Math.max(box[2] - box[0], box[3] - box[1]) < 2 * near;
-      if (isSmall || within(rings, east, north)) best = { id, size };
+      if (isSmall || this.context?.isPointInPath(traced(rings), x * ratio, y * ratio, "evenodd") === true) best = { id, size };
     }
     return best?.id ?? null;
   }
@@ -363,14 +351,14 @@ function cellsOf(shapes: readonly Shape[], colours: ColourOf): Cell[] {
     const key = `${category} ${colour} ${Math.floor((box[0] - x0) / side)} ${Math.floor((box[1] - y0) / side)}`;
     const cell = found.get(key) ?? { category, colour, path: new Path2D(), box };
     cell.box = united([cell.box, box]);
-    trace(cell.path, rings);
+    traced(rings, cell.path);
     found.set(key, cell);
   }
   const order = (category: Category): number => CATEGORY_NAMES.indexOf(category);
   return [...found.values()].sort((a, b) => order(a.category) - order(b.category));
 }
 
-function trace(path: Path2D, rings: readonly Float32Array[]): void {
+function traced(rings: readonly Float32Array[], path = new Path2D()): Path2D {
   for (const ring of rings) {
     for (let i = 0; i < ring.length; i += 2) {
       if (i === 0) path.moveTo(ring[0], ring[1]);
@@ -378,37 +366,13 @@ function trace(path: Path2D, rings: readonly Float32Array[]): void {
     }
     path.closePath();
   }
+  return path;
 }
 
 function boxOf(rings: readonly Float32Array[]): Box {
-  const box: Box = [Infinity, Infinity, -Infinity, -Infinity];
-  for (const ring of rings) {
-    for (let i = 0; i < ring.length; i += 2) {
-      box[0] = Math.min(box[0], ring[i]);
-      box[1] = Math.min(box[1], ring[i + 1]);
-      box[2] = Math.max(box[2], ring[i]);
-      box[3] = Math.max(box[3], ring[i + 1]);
-    }
-  }
-  return box;
-}
-
-function united(boxes: readonly Box[]): Box {
-  return boxes.reduce(([a, b, c, d], [x0, y0, x1, y1]) => [Math.min(a, x0), Math.min(b, y0), Math.max(c, x1), Math.max(d, y1)]);
+  return boxAround(rings.flatMap((ring) => Array.from({ length: ring.length / 2 }, (_, i) => [ring[2 * i], ring[2 * i + 1]])));
 }
 
 function meet(a: Box, b: Box): boolean {
   return a[0] <= b[2] && b[0] <= a[2] && a[1] <= b[3] && b[1] <= a[3];
-}
-
-/** Whether a place is inside of an odd number of rings. */
-function within(rings: readonly Float32Array[], x: number, y: number): boolean {
-  let inside = false;
-  for (const ring of rings) {
-    for (let i = 0, j = ring.length - 2; i < ring.length; j = i, i += 2) {
-      const [ay, by] = [ring[i + 1], ring[j + 1]];
-      if (ay > y !== by > y && x < ring[i] + ((y - ay) / (by - ay)) * (ring[j] - ring[i])) inside = !inside;
-    }
-  }
-  return inside;
 }

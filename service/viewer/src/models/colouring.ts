@@ -1,8 +1,10 @@
 /** What the colour of a roof shows: the choices of the view, their classes and their colours. */
 
+import { Color } from "three";
 import { reasonWords } from "../words/reasons";
-import { bytesOf, CATEGORIES, type Category } from "../words/roof_types";
+import { CATEGORIES, type Category } from "../words/roof_types";
 import { SURFACE, type Batch, type Listed } from "./batching";
+import { countOf } from "./selection";
 
 /** A colour with its meaning. */
 export interface ColourClass {
@@ -21,8 +23,6 @@ export const COLOURINGS = {
 } as const;
 
 export type Colouring = keyof typeof COLOURINGS;
-
-export const COLOURING_NAMES = Object.keys(COLOURINGS) as Colouring[];
 
 const GREY = "#8d99a6";
 const PLAIN = "#cbc3b6"; // of roofs below coloured points
@@ -70,11 +70,7 @@ export type Counted = ColourClass & { count: number };
 
 /** The classes that the buildings have, with the number of each. */
 export function classesOf(colouring: "residual" | "status" | "reason", buildings: readonly Listed[]): Counted[] {
-  const counts = new Map<ColourClass, number>();
-  for (const building of buildings) {
-    const one = classOf(colouring, building.category, building.reason, building.figures.within ?? null);
-    counts.set(one, (counts.get(one) ?? 0) + 1);
-  }
+  const counts = countOf(buildings.map(({ category, reason, figures }) => classOf(colouring, category, reason, figures.within ?? null)));
   const order: readonly ColourClass[] =
     colouring === "residual" ? RESIDUALS : colouring === "status" ? STATUSES : [NO_REASON, ...REASONS.values(), OTHER_REASON];
   return [...order, LEFT_OUT].flatMap((one) => (counts.has(one) ? [{ ...one, count: counts.get(one) ?? 0 }] : []));
@@ -97,48 +93,43 @@ function classOf(
   }
 }
 
-/** The colour of an object's outline on the map; outlines have no planes. */
+/** What the colours of roofs show: one of the choices, or a colour for each id; null is that of the type. */
+export type RoofColours = Colouring | ((id: string) => string | null);
+
+function colourOf(colouring: Colouring, category: Category, reason: string | null, withinShare: number | null): string {
+  if (colouring === "type") return CATEGORIES[category].colour;
+  if (colouring === "plain") return PLAIN;
+  return colouring === "plane" ? GREY : classOf(colouring, category, reason, withinShare).colour;
+}
+
+/** The colour of an object's outline on the map; outlines have no planes, and none but grey are seen without colours. */
 export function outlineColour(colouring: Colouring, { category, reason, figures }: Listed): string {
-  switch (colouring) {
-    case "type":
-      return CATEGORIES[category].colour;
-    case "plane":
-    case "plain":
-      return GREY;
-    default:
-      return classOf(colouring, category, reason, figures.within ?? null).colour;
-  }
+  return colouring === "plain" ? GREY : colourOf(colouring, category, reason, figures.within ?? null);
 }
 
 /** Red, green, blue, opaque for each corner of a batch; in the linear space that three works in. */
-export function coloursOf(batch: Batch, colouring: Colouring): Uint8Array {
-  const colours = new Uint8Array(4 * batch.surfaces.length).fill(255);
+export function coloursOf(batch: Batch, shown: RoofColours): Uint8Array {
+  const { ids, category, reasons, withinShare, starts, surfaces } = batch;
+  const colours = new Uint8Array(4 * surfaces.length).fill(255);
   const cycle = CYCLE.map(linear);
-  for (let building = 0; building < batch.ids.length; building++) {
-    let roof = linear(GREY); // of faces without a numbered plane
-    if (colouring === "type") roof = linear(CATEGORIES[batch.category].colour);
-    else if (colouring === "plain") roof = linear(PLAIN);
-    else if (colouring !== "plane") {
-      roof = linear(classOf(colouring, batch.category, batch.reasons[building], batch.withinShare[building]).colour);
-    }
-    for (let corner = batch.starts[building]; corner < batch.starts[building + 1]; corner++) {
-      const surface = batch.surfaces[corner];
+  ids.forEach((id, n) => {
+    const given = typeof shown === "function" ? shown(id) : null;
+    const roof = linear(given ?? colourOf(typeof shown === "function" ? "type" : shown, category, reasons[n], withinShare[n]));
+    for (let corner = starts[n]; corner < starts[n + 1]; corner++) {
+      const surface = surfaces[corner];
       let colour = roof;
       if (surface === SURFACE.wall) colour = WALL;
       else if (surface === SURFACE.ground) colour = FLOOR;
-      else if (colouring === "plane" && surface >= 0) colour = cycle[surface % cycle.length];
-      for (let part = 0; part < 3; part++) colours[4 * corner + part] = colour[part];
+      else if (shown === "plane" && surface >= 0) colour = cycle[surface % cycle.length];
+      colours.set(colour, 4 * corner);
     }
-  }
+  });
   return colours;
 }
 
-/** IEC 61966-2-1: sRGB to linear light, both as bytes. */
-export function linear(colour: string): number[] {
-  return bytesOf(colour).map((byte) => {
-    const value = byte / 255;
-    return Math.round(255 * (value <= 0.04045 ? value / 12.92 : ((value + 0.055) / 1.055) ** 2.4));
-  });
+/** Linear light of a colour, as bytes. */
+function linear(colour: string): number[] {
+  return new Color(colour).toArray().map((value) => Math.round(255 * value));
 }
 
 const [WALL, FLOOR] = [linear("#ece7de"), linear("#b9b3a8")];

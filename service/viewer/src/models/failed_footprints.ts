@@ -3,6 +3,7 @@ import { Batcher, type Batch } from "./batching";
 import type { SceneFrame } from "./building_mesh";
 import type { Face } from "./cityjson";
 import type { Outlines } from "./outlines";
+import { areaOf, polygonsOf } from "./plan";
 
 const ABOVE_GROUND_M = 0.25;
 
@@ -21,47 +22,24 @@ export function flatOutlines(
   for (const { geometry, properties, id } of features) {
     const name = properties["building_id"] ?? properties["object_id"] ?? id;
     if (typeof name !== "string") continue;
-    const vertices: number[] = [];
-    const faces: Face[] = polygonsOf(geometry).map((rings) => ({
-      kind: "roof",
-      rings: rings.map((ring) =>
-        // GeoJSON repeats the first position at the end
+    const vertices: [number, number, number][] = [];
+    const faces = polygonsOf(geometry).map((polygon): Face => {
+      // GeoJSON repeats the first position at the end
+      const rings = polygon.map((ring) =>
         ring.slice(0, -1).map(([easting, northing]) => {
           const x = (easting - frame.origin[0]) * frame.horizontalUnitM;
           const y = (northing - frame.origin[1]) * frame.horizontalUnitM;
-          vertices.push(x, y, groundAt(x, y) + ABOVE_GROUND_M);
-          return vertices.length / 3 - 1;
+          return vertices.push([x, y, groundAt(x, y) + ABOVE_GROUND_M]) - 1;
         }),
-      ),
-    }));
-    level(vertices);
-    for (const { rings } of faces) if (seenFromBelow(vertices, rings[0] ?? [])) rings.forEach((ring) => ring.reverse());
-    batcher.add({ id: name, attributes: { status, reason: properties["reason"] }, vertices: Float64Array.from(vertices), faces, levels: [] });
+      );
+      // many writers ignore RFC 7946
+      if (areaOf(polygon[0] ?? []) < 0) for (const ring of rings) ring.reverse();
+      return { kind: "roof", rings };
+    });
+    // a face must be planar
+    const top = vertices.reduce((highest, [, , z]) => Math.max(highest, z), -Infinity);
+    const level = Float64Array.from(vertices.flatMap(([x, y]) => [x, y, top]));
+    batcher.add({ id: name, attributes: { status, reason: properties["reason"] }, vertices: level, faces, levels: [] });
   }
   return { batches: batcher.take(), outlines: batcher.takeOutlines() };
-}
-
-type Ring = [number, number][];
-
-function polygonsOf(geometry: Feature["geometry"]): Ring[][] {
-  if (geometry?.type === "Polygon") return [geometry.coordinates as Ring[]];
-  if (geometry?.type === "MultiPolygon") return geometry.coordinates as Ring[][];
-  return [];
-}
-
-/** Whether a ring runs clockwise: many writers ignore RFC 7946. */
-function seenFromBelow(vertices: readonly number[], ring: readonly number[]): boolean {
-  let area = 0;
-  ring.forEach((from, i) => {
-    const to = ring[(i + 1) % ring.length];
-    area += vertices[3 * from] * vertices[3 * to + 1] - vertices[3 * to] * vertices[3 * from + 1];
-  });
-  return area < 0;
-}
-
-/** Lift all vertices to the highest one: a face must be planar. */
-function level(vertices: number[]): void {
-  let top = -Infinity;
-  for (let i = 2; i < vertices.length; i += 3) top = Math.max(top, vertices[i]);
-  for (let i = 2; i < vertices.length; i += 3) vertices[i] = top;
 }

@@ -1,6 +1,8 @@
-import { chunks } from "../api/json_lines";
+import { chunks } from "../api/lines";
 import { request } from "../api/requests";
-import type { FromLoading, Reading, ToLoading } from "./loading_messages";
+import type { FromLoading, Reading, ToLoading } from "./model_loading.worker";
+
+export type { FromLoading };
 
 /**
  * Fetches models and reads them in a worker.
@@ -17,7 +19,6 @@ export async function loadModels(
   signal: AbortSignal,
 ): Promise<string[]> {
   const response = await request(path, { headers: { Accept: "application/city+json-seq" }, signal });
-  if (response.body === null) throw new TypeError("the answer has no body");
   const worker = new Worker(new URL("./model_loading.worker.ts", import.meta.url), { type: "module" });
   try {
     const read = new Promise<string[]>((resolve, reject) => {
@@ -29,18 +30,14 @@ export async function loadModels(
       worker.onerror = (event) => reject(new Error(event.message || "the reader of the models could not start"));
       signal.addEventListener("abort", () => reject(new DOMException("cancelled", "AbortError")));
     });
-    const [levels] = await Promise.all([read, send(response.body, reading, worker)]);
+    const [levels] = await Promise.all([read, send(chunks(response.body), reading, worker)]);
     return levels;
   } finally {
     worker.terminate();
   }
 }
 
-async function send(
-  body: ReadableStream<Uint8Array>,
-  reading: Reading,
-  worker: Worker,
-): Promise<void> {
-  for await (const bytes of chunks(body)) worker.postMessage({ ...reading, bytes } satisfies ToLoading);
+async function send(body: AsyncIterable<Uint8Array>, reading: Reading, worker: Worker): Promise<void> {
+  for await (const bytes of body) worker.postMessage({ ...reading, bytes } satisfies ToLoading);
   worker.postMessage({ ...reading, bytes: null } satisfies ToLoading);
 }

@@ -1,9 +1,31 @@
 /** Reads and triangulates the models in a worker, which keeps the page responsive. It fetches nothing itself. */
 
-import { jsonLines } from "../api/json_lines";
-import { Batcher } from "./batching";
+import { jsonLines } from "../api/lines";
+import { Batcher, type Batch, type Listed } from "./batching";
 import { SequenceReader, type Building } from "./cityjson";
-import type { FromLoading, Reading, ToLoading } from "./loading_messages";
+import type { Outlines } from "./outlines";
+
+/** A piece of the CityJSONSeq for the worker. */
+export interface ToLoading {
+  /** Null at the end. */
+  bytes: Uint8Array | null;
+  /** Metres in a unit of the coordinates. */
+  horizontalUnitM: number;
+  verticalUnitM: number;
+  /** The shown level of detail; null for the finest of each building. */
+  lod: string | null;
+}
+
+/** How the models are read. */
+export type Reading = Omit<ToLoading, "bytes">;
+
+/** Messages of the worker. */
+export type FromLoading =
+  | { kind: "frame"; origin: [number, number, number] }
+  | { kind: "buildings"; listed: Listed[]; batches: Batch[]; outlines: Outlines }
+  /** The levels of detail to choose from, coarse to fine; empty if each building has one. */
+  | { kind: "finished"; levels: string[] }
+  | { kind: "failed"; detail: string };
 
 const FIRST_BATCH = 200; // buildings; each batch is twice as large: something to see at once, few batches in the end
 
@@ -35,13 +57,13 @@ async function read({ horizontalUnitM, verticalUnitM, lod }: Reading): Promise<v
   const reader = new SequenceReader(lod);
   const early: Building[] = []; // those without a vertex, before the origin is known
   let batcher: Batcher | null = null;
-  let listed: ReturnType<Batcher["add"]>[] = [];
+  let listed: Listed[] = [];
   let size = FIRST_BATCH;
   const give = (): void => {
     if (batcher === null) return;
     const batches = batcher.take();
     const outlines = batcher.takeOutlines();
-    tell({ kind: "buildings", listed, batches, outlines }, [...batches.flatMap(buffersOf), ...outlineBuffers(outlines)]);
+    tell({ kind: "buildings", listed, batches, outlines }, [...batches, outlines].flatMap(buffersOf));
     listed = [];
   };
   for await (const line of jsonLines(arriving())) {
@@ -77,20 +99,9 @@ function originOf(reader: SequenceReader, { vertices }: Building): [number, numb
   return [Math.round(vertices[0]), Math.round(vertices[1]), Math.floor(vertices[2])];
 }
 
-function buffersOf(batch: ReturnType<Batcher["take"]>[number]): Transferable[] {
-  return [
-    batch.starts.buffer,
-    batch.edgeStarts.buffer,
-    batch.boxes.buffer,
-    batch.positions.buffer,
-    batch.normals.buffer,
-    batch.surfaces.buffer,
-    batch.edges.buffer,
-  ];
-}
-
-function outlineBuffers({ shapeStarts, ringStarts, xy }: ReturnType<Batcher["takeOutlines"]>): Transferable[] {
-  return [shapeStarts.buffer, ringStarts.buffer, xy.buffer];
+/** What is handed over and not copied: the arrays of a batch or of outlines. */
+function buffersOf(packed: Batch | Outlines): Transferable[] {
+  return Object.values(packed).flatMap((value) => (ArrayBuffer.isView(value) ? [value.buffer as ArrayBuffer] : []));
 }
 
 function tell(message: FromLoading, transfer: Transferable[] = []): void {

@@ -1,6 +1,7 @@
 import { isFlat, type Category } from "../words/roof_types";
 import { inScene, type SceneFrame } from "./building_mesh";
 import type { Building } from "./cityjson";
+import { areaOf, type Point } from "./plan";
 
 /** The outlines of many objects in plan, packed so that they can be handed from a worker to the page. */
 export interface Outlines {
@@ -31,9 +32,9 @@ export class OutlinesInMaking {
     for (const { kind, rings } of building.faces) {
       if (kind !== wanted) continue;
       rings.forEach((ring, place) => {
-        const from = this.xy.length;
-        for (const corner of ring) this.xy.push(vertices[3 * corner], vertices[3 * corner + 1]);
-        if (isClockwise(this.xy, from) !== place > 0) turnAround(this.xy, from);
+        const places = ring.map((corner): Point => [vertices[3 * corner], vertices[3 * corner + 1]]);
+        if (areaOf(places) < 0 !== place > 0) places.reverse();
+        this.xy.push(...places.flat());
         this.ringStarts.push(this.xy.length / 2);
       });
     }
@@ -51,21 +52,4 @@ export class OutlinesInMaking {
       xy: Float32Array.from(this.xy),
     };
   }
-}
-
-function isClockwise(xy: readonly number[], from: number): boolean {
-  let area = 0;
-  for (let i = from, j = xy.length - 2; i < xy.length; j = i, i += 2) {
-    // relative to the first point: far from the origin the products would lose the digits that matter
-    const [ax, ay, bx, by] = [xy[j] - xy[from], xy[j + 1] - xy[from + 1], xy[i] - xy[from], xy[i + 1] - xy[from + 1]];
-    area += ax * by - bx * ay;
-  }
-  return area < 0;
-}
-
-/** Reverse the order of the points from a place on. */
-function turnAround(xy: number[], from: number): void {
-  const points: [number, number][] = [];
-  for (let i = from; i < xy.length; i += 2) points.push([xy[i], xy[i + 1]]);
-  xy.splice(from, xy.length - from, ...points.reverse().flat());
 }

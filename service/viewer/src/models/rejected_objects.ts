@@ -2,7 +2,7 @@
 
 import { decompress } from "fzstd";
 import { parquetMetadata, parquetReadObjects } from "hyparquet";
-import { ofRun, request } from "../api/requests";
+import { partOf, request, type Run } from "../api/requests";
 import type { Feature } from "../api/types";
 import type { Listed } from "./batching";
 import { figuresOf } from "./figures";
@@ -16,11 +16,9 @@ const COLUMNS = ["object_id", "reason", "reason_detail", "geometry", "area_m2", 
  * @returns For each object a GeoJSON feature in the coordinates of the tiles; its geometry is the box around it.
  * @throws Problem if it cannot be fetched, Error if it cannot be read, AbortError if cancelled.
  */
-export async function rejectedObjects(jobPath: string, method: string | null, signal: AbortSignal): Promise<Feature[]> {
-  const response = await request(ofRun(`${jobPath}/results/rejected`, method), {
-    headers: { Accept: "application/vnd.apache.parquet" },
-    signal,
-  });
+export async function rejectedObjects(run: Run, signal: AbortSignal): Promise<Feature[]> {
+  const headers = { Accept: "application/vnd.apache.parquet" };
+  const response = await request(partOf(run, "results/rejected"), { headers, signal });
   return readRejected(await response.arrayBuffer());
 }
 

@@ -1,17 +1,16 @@
 /** The objects of a run as they arrive: the candidates, and once they are wanted those that were left out. */
 
-import { getJson, ofRun, runReport } from "../api/requests";
+import { getJson, partOf, runReport, type Run } from "../api/requests";
 import type { Feature, RunReport } from "../api/types";
 import type { Category } from "../words/roof_types";
 import type { Listed } from "./batching";
 import type { SceneFrame } from "./building_mesh";
-import type { FromLoading } from "./loading_messages";
-import { loadModels } from "./model_loading";
+import { loadModels, type FromLoading } from "./model_loading";
 import { modelUnits } from "./units";
 
 type Buildings = Extract<FromLoading, { kind: "buildings" }>;
 
-export class RunObjects {
+export class RunObjects implements Run {
   readonly listed: Listed[] = [];
   /** Those that were left out, by id; they are listed, too. */
   readonly rejected = new Map<string, Listed>();
@@ -50,7 +49,7 @@ export class RunObjects {
   }
 
   async readReport(signal: AbortSignal): Promise<void> {
-    this.report = await runReport(this.jobPath, this.method, signal);
+    this.report = await runReport(this, signal);
     this.counts.set("rejected", this.report.counts?.["rejected"] ?? 0);
   }
 
@@ -60,12 +59,12 @@ export class RunObjects {
       if (message.kind === "frame" && lod === null) this.origin = message.origin;
       if (message.kind === "buildings") onBuildings(message);
     };
-    return loadModels(ofRun(`${this.jobPath}/results/cityjson`, this.method), { ...modelUnits(this.report.crs), lod }, onMessage, signal);
+    return loadModels(partOf(this, "results/cityjson"), { ...modelUnits(this.report.crs), lod }, onMessage, signal);
   }
 
   /** Buildings without a model: only the records have their place. */
   async failed(signal: AbortSignal): Promise<Feature[]> {
-    const path = ofRun(`${this.jobPath}/buildings?status=failed&limit=10000&crs=native`, this.method);
+    const path = partOf(this, "buildings?status=failed&limit=10000&crs=native");
     const { features } = await getJson<{ features: Feature[] }>(path, { signal, headers: { Accept: "application/geo+json" } });
     this.placeBy(features);
     return features;
@@ -74,7 +73,7 @@ export class RunObjects {
   /** Read the objects that were left out; they are listed by `add`. */
   async readRejected(signal: AbortSignal): Promise<Feature[]> {
     const { listedRejected, rejectedObjects } = await import("./rejected_objects");
-    const features = await rejectedObjects(this.jobPath, this.method, signal);
+    const features = await rejectedObjects(this, signal);
     for (const object of features.map(listedRejected)) this.rejected.set(object.id, object);
     this.placeBy(features);
     return features;

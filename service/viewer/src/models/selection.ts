@@ -153,31 +153,33 @@ export function selected(objects: readonly Listed[], wanted: Wanted): Listed[] {
 }
 
 const WEIGHTS: Partial<Record<Category, number>> = { failed: 0, rejected: 1, doubtful: 2, fallback: 3 };
-const weight = ({ category }: Listed): number => WEIGHTS[category] ?? 4;
+const LARGER_THAN_ALL_M2 = 1e9;
 
-/** Compares two objects; those without the figure come last in both directions, and ties follow the ids. */
-function orderOf({ sort, descending }: Wanted): (a: Listed, b: Listed) => number {
-  const byId = (a: Listed, b: Listed): number => (a.id < b.id ? -1 : a.id > b.id ? 1 : 0);
-  const sign = descending ? -1 : 1;
+/** What objects are sorted by; null for one that does not have it. */
+function keyOf(sort: Sort, { id, category, reason, figures }: Listed): string | number | null {
   switch (sort) {
     case "problems":
-      return (a, b) => sign * (weight(a) - weight(b) || (b.figures.area ?? 0) - (a.figures.area ?? 0)) || byId(a, b);
+      return (WEIGHTS[category] ?? 4) * LARGER_THAN_ALL_M2 - (figures.area ?? 0);
     case "id":
-      return (a, b) => sign * byId(a, b);
+      return id;
     case "roof":
-      return (a, b) => sign * (PLACE[a.category] - PLACE[b.category]) || byId(a, b);
+      return CATEGORY_NAMES.indexOf(category);
     case "reason":
-      return (a, b) => lastIfMissing(a.reason, b.reason, sign) || byId(a, b);
+      return reason;
     default:
-      return (a, b) => lastIfMissing(a.figures[sort] ?? null, b.figures[sort] ?? null, sign) || byId(a, b);
+      return figures[sort] ?? null;
   }
 }
 
-const PLACE = Object.fromEntries(CATEGORY_NAMES.map((name, place) => [name, place])) as Record<Category, number>;
-
-function lastIfMissing(a: string | number | null, b: string | number | null, sign: number): number {
-  if (a === null || b === null) return Number(a === null) - Number(b === null);
-  return a < b ? -sign : a > b ? sign : 0;
+/** Compares two objects; those without the figure come last in both directions, and ties follow the ids. */
+function orderOf({ sort, descending }: Wanted): (a: Listed, b: Listed) => number {
+  const compare = (a: string | number, b: string | number): number => (a < b ? -1 : a > b ? 1 : 0);
+  return (a, b) => {
+    const [first, second] = [keyOf(sort, a), keyOf(sort, b)];
+    const isEither = first === null || second === null;
+    const order = isEither ? Number(first === null) - Number(second === null) : compare(first, second) * (descending ? -1 : 1);
+    return order || compare(a.id, b.id);
+  };
 }
 
 /** Number of objects of each category and of each reason that the other filters let through. */
@@ -185,16 +187,19 @@ export function tallies(
   objects: readonly Listed[],
   wanted: Wanted,
 ): { categories: Map<Category, number>; reasons: Map<string, number> } {
-  const categories = new Map<Category, number>();
-  const reasons = new Map<string, number>();
   const anyReason = { ...wanted, reasons: new Set<string>() };
-  for (const object of objects) {
-    if (fitsRest(wanted, object)) categories.set(object.category, (categories.get(object.category) ?? 0) + 1);
-    if (object.reason !== null && fits(anyReason, object)) {
-      reasons.set(object.reason, (reasons.get(object.reason) ?? 0) + 1);
-    }
-  }
-  return { categories, reasons };
+  const listed = objects.filter((object) => fits(anyReason, object)).map(({ reason }) => reason);
+  return {
+    categories: countOf(objects.filter((object) => fitsRest(wanted, object)).map(({ category }) => category)),
+    reasons: countOf(listed.filter((reason) => reason !== null)),
+  };
+}
+
+/** How often each of these is among them. */
+export function countOf<T>(all: readonly T[]): Map<T, number> {
+  const counts = new Map<T, number>();
+  for (const one of all) counts.set(one, (counts.get(one) ?? 0) + 1);
+  return counts;
 }
 
 /** The categories of a status, in the words of the page. */

@@ -1,22 +1,42 @@
-import type { Problem } from "../api/requests";
-import { el } from "./elements";
+import { button, el } from "./elements";
 import { asProblem, problemNotice } from "./notices";
 import "./action_menu.css";
 
 /** An entry of a menu: something to do, or somewhere to go. */
 export type Item = { label: string; act: () => Promise<void> | void } | { label: string; href: string };
 
+/** What opens below a button; Escape, a click elsewhere and leaving it by the keyboard close it. */
+export function dropDown(opener: HTMLElement, content: HTMLElement, kind = ""): HTMLDetailsElement {
+  content.classList.add("menu-list");
+  const menu = el("details", { class: `menu ${kind}` }, opener, content);
+  const elsewhere = (event: Event): void => {
+    if (!menu.contains(event.target as Node)) menu.open = false;
+  };
+  menu.addEventListener("toggle", () => {
+    if (menu.open) document.addEventListener("pointerdown", elsewhere);
+    else document.removeEventListener("pointerdown", elsewhere);
+  });
+  menu.addEventListener("keydown", (event) => {
+    if (event.key !== "Escape" || !menu.open) return;
+    menu.open = false;
+    opener.focus();
+  });
+  menu.addEventListener("focusout", ({ relatedTarget }) => {
+    if (relatedTarget !== null && !menu.contains(relatedTarget as Node)) menu.open = false;
+  });
+  return menu;
+}
+
 /**
- * A button that opens a menu of actions; Escape, a click elsewhere and leaving it by the keyboard close it.
+ * A button that opens a menu of actions.
  *
  * @param name What the actions are for, for screen readers.
  * @param items The entries at the time at which it is opened.
- * @param onProblem Gets what went wrong; the menu shows it, too.
  */
-export function actionMenu(name: string, items: () => Item[], onProblem: (problem: Problem) => void): HTMLElement {
-  const list = el("div", { class: "menu-list" });
+export function actionMenu(name: string, items: () => Item[]): HTMLElement {
+  const list = el("div");
   const opener = el("summary", { class: "button quiet", "aria-label": `Actions for ${name}` }, el("span", { class: "actions-word" }, "Actions"), el("span", { class: "actions-dots" }, "⋯"));
-  const menu = el("details", { class: "menu actions-menu" }, opener, list);
+  const menu = dropDown(opener, list, "actions-menu");
   const close = (): void => {
     menu.open = false;
   };
@@ -26,37 +46,20 @@ export function actionMenu(name: string, items: () => Item[], onProblem: (proble
     try {
       await act();
     } catch (error) {
-      const problem = asProblem(error);
-      onProblem(problem);
       menu.open = true;
-      fill(problemNotice(problem));
+      fill(problemNotice(asProblem(error)));
     }
   };
   const fill = (note: HTMLElement | null = null): void => {
     const entries = items().map((item) =>
       "href" in item
         ? el("a", { class: "button quiet", href: item.href, onclick: close }, item.label)
-        : el("button", { type: "button", class: "quiet", onclick: () => void perform(item.act) }, item.label),
+        : button(item.label, () => void perform(item.act), { class: "quiet" }),
     );
     list.replaceChildren(...entries, ...(note === null ? [] : [note]));
   };
-  const elsewhere = (event: Event): void => {
-    if (!menu.contains(event.target as Node)) close();
-  };
   opener.addEventListener("click", () => {
     if (!menu.open) fill(); // it opens after the click
-  });
-  menu.addEventListener("toggle", () => {
-    if (menu.open) document.addEventListener("pointerdown", elsewhere);
-    else document.removeEventListener("pointerdown", elsewhere);
-  });
-  menu.addEventListener("keydown", (event) => {
-    if (event.key !== "Escape" || !menu.open) return;
-    close();
-    opener.focus();
-  });
-  menu.addEventListener("focusout", ({ relatedTarget }) => {
-    if (relatedTarget !== null && !menu.contains(relatedTarget as Node)) close();
   });
   return menu;
 }

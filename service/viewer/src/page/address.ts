@@ -7,21 +7,18 @@ export interface Place {
   building: string | null;
 }
 
-const PLACE = /^#\/jobs\/([^/?]+)(?:\/methods\/([^/?]+))?(?:\/buildings\/([^/?]+))?/;
-
 /** `#/jobs/<job>`, then `/methods/<label>` and `/buildings/<building>` if they are named; null for the start. */
 export function placeOf(hash: string): Place | null {
-  const found = PLACE.exec(hash);
-  if (found === null) return null;
-  const [job, method, building] = found.slice(1).map((part) => (part === undefined ? null : decoded(part)));
-  return { job: job ?? "", method: method ?? null, building: building ?? null };
+  const { name, rest: [job, ...pairs] } = partsOf(hash);
+  if (name !== "jobs" || job === undefined) return null;
+  const named = (kind: string): string | null => pairs.find((_, i) => i % 2 === 1 && pairs[i - 1] === kind) ?? null;
+  return { job, method: named("methods"), building: named("buildings") };
 }
 
 /** The address of a place; the query says what of it is shown. */
 export function addressOf({ job, method, building }: Place, query = ""): string {
-  const parts = [["jobs", job], ["methods", method], ["buildings", building]] as const;
-  const path = parts.map(([name, value]) => (value === null ? "" : `/${name}/${encodeURIComponent(value)}`)).join("");
-  return `#${path}${query === "" ? "" : `?${query}`}`;
+  const words = ["jobs", job, ...(method === null ? [] : ["methods", method]), ...(building === null ? [] : ["buildings", building])];
+  return `${hashOf(words)}${query === "" ? "" : `?${query}`}`;
 }
 
 /** The query of an address: what follows the question mark; empty if there is none. */

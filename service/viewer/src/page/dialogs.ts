@@ -1,8 +1,7 @@
 /** Dialogs of the page: questions before something is lost, and forms. */
 
-import { Problem } from "../api/requests";
-import { el } from "./elements";
-import { asProblem, problemNotice } from "./notices";
+import { button, el } from "./elements";
+import { asProblem, report } from "./notices";
 import "./dialogs.css";
 
 /** An open dialog. */
@@ -18,9 +17,8 @@ let number = 0;
  *
  * @param title Its heading.
  * @param content Its content.
- * @param onClose Called once, however it is closed.
  */
-export function openDialog(title: string, content: (Node | null)[], onClose: () => void = () => undefined): Opened {
+export function openDialog(title: string, content: (Node | null)[]): Opened {
   const id = `dialog-${(number += 1)}`;
   const element = el("dialog", { class: "dialog", "aria-labelledby": id }, el("h2", { id }, title), ...content);
   const before = document.activeElement;
@@ -31,80 +29,65 @@ export function openDialog(title: string, content: (Node | null)[], onClose: () 
     window.removeEventListener("hashchange", close);
     element.remove();
     if (before instanceof HTMLElement && before.isConnected) before.focus();
-    onClose();
   });
   document.body.append(element);
   element.showModal();
   return { element, close };
 }
 
-/** Does what a dialog is about; may return what is done once the dialog is closed. */
+/** What a form does; may return what is done once it is closed. */
 export type Act = () => Promise<void | (() => void)>;
 
-/** A question whose answer cannot be taken back. */
-export interface Question {
-  title: string;
-  text: string;
-  /** The words on the button that does it. */
-  yes: string;
-  /** What is done on yes; the dialog shows its failure and stays open. */
-  act: Act;
-  onProblem?: (problem: Problem) => void;
-}
-
-/** Ask before something is done. */
-export function ask({ title, text, yes, act, onProblem }: Question): void {
-  const note = el("div");
-  const go = el("button", { type: "button", class: "danger" }, yes);
-  const no = el("button", { type: "button", class: "quiet", autofocus: true }, "No, go back");
-  const { close } = openDialog(title, [el("p", {}, text), note, el("div", { class: "actions" }, no, go)]);
-  no.addEventListener("click", close);
-  go.addEventListener("click", () => void perform(go, note, act, close, onProblem));
-}
-
-/** A form in a dialog, with a button that sends it and one that leaves it. */
-export interface DialogForm {
-  title: string;
+/** A form with a button that sends it and one that leaves it. */
+export interface SentForm {
   content: (Node | null)[];
+  /** The words on the button that sends it. */
   send: string;
-  /** Send the form; the dialog shows its failure and stays open. */
+  /** What it does; the form shows its failure and stays. */
   act: Act;
-  onProblem?: (problem: Problem) => void;
 }
 
-/** Open a form. */
-export function openForm({ title, content, send, act, onProblem }: DialogForm): void {
+/**
+ * A form that is sent at most once at a time.
+ *
+ * @param leave Leaves it.
+ * @param close Closes it after it was sent, or if the page asks for a key, in a dialog of its own.
+ */
+export function sentForm({ content, send, act }: SentForm, leave: HTMLElement, close: () => void, kind = "primary"): HTMLFormElement {
   const note = el("div");
-  const go = el("button", { type: "submit", class: "primary" }, send);
-  const no = el("button", { type: "button", class: "quiet" }, "Cancel");
-  const form = el("form", { novalidate: true }, ...content, note, el("div", { class: "actions" }, no, go));
-  const { close } = openDialog(title, [form]);
-  no.addEventListener("click", close);
+  const go = el("button", { type: "submit", class: kind }, send);
+  const perform = async (): Promise<void> => {
+    if (go.getAttribute("aria-disabled") === "true") return;
+    go.setAttribute("aria-disabled", "true"); // not `disabled`: it keeps the focus
+    note.replaceChildren();
+    try {
+      const afterwards = await act();
+      close();
+      afterwards?.();
+    } catch (error) {
+      if (asProblem(error).status === 401) close();
+      report(note, error);
+    } finally {
+      go.removeAttribute("aria-disabled");
+    }
+  };
+  const form = el("form", { novalidate: true }, ...content, note, el("div", { class: "actions" }, leave, go));
   form.addEventListener("submit", (event) => {
     event.preventDefault();
-    void perform(go, note, act, close, onProblem);
+    void perform();
   });
+  return form;
 }
 
-async function perform(
-  button: HTMLButtonElement,
-  note: HTMLElement,
-  act: Act,
-  close: () => void,
-  onProblem?: (problem: Problem) => void,
-): Promise<void> {
-  if (button.getAttribute("aria-disabled") === "true") return;
-  button.setAttribute("aria-disabled", "true"); // not `disabled`: it keeps the focus
-  note.replaceChildren();
-  try {
-    const afterwards = await act();
-    close();
-    afterwards?.();
-  } catch (error) {
-    const problem = asProblem(error);
-    button.removeAttribute("aria-disabled");
-    if (problem.status === 401) close(); // the page asks for a key, in a dialog of its own
-    note.replaceChildren(problemNotice(problem));
-    onProblem?.(problem);
-  }
+/** Open a form in a dialog. */
+export function openForm(title: string, form: SentForm): Opened {
+  const no = button("Cancel", () => opened.close(), { class: "quiet" });
+  const opened = openDialog(title, [sentForm(form, no, () => opened.close())]);
+  return opened;
+}
+
+/** Ask before something is done that cannot be taken back. */
+export function ask(title: string, text: string, form: Omit<SentForm, "content">): void {
+  const no = button("No, go back", () => opened.close(), { class: "quiet", autofocus: true });
+  const opened = openDialog(title, [sentForm({ ...form, content: [el("p", {}, text)] }, no, () => opened.close(), "danger")]);
 }

@@ -1,7 +1,7 @@
 import { CATEGORIES, isHatched, type Category } from "../words/roof_types";
 
-type Child = Node | string | number | null | undefined | false;
-type Properties = Record<string, string | number | boolean | ((event: never) => void) | null | undefined>;
+export type Child = Node | string | number | null | undefined | false;
+export type Properties = Record<string, string | number | boolean | ((event: never) => void) | null | undefined>;
 
 /**
  * An element with attributes (`on…` functions are listeners; null and false leave an attribute out) and children.
@@ -25,6 +25,32 @@ export function svg(tag: string, properties: Properties = {}, ...children: Child
   setProperties(element, properties);
   element.append(...present(children));
   return element;
+}
+
+/** A button that does something. */
+export function button(words: string, act: (() => void) | null, properties: Properties = {}): HTMLButtonElement {
+  return el("button", { type: "button", ...properties, onclick: act }, words);
+}
+
+/** Whether a button is pressed, or to press it or release it. */
+export const isPressed = (one: HTMLElement): boolean => one.getAttribute("aria-pressed") === "true";
+export const setPressed = (one: HTMLElement, pressed: boolean): void => one.setAttribute("aria-pressed", String(pressed));
+
+/** What keys do in an element; with Ctrl, Alt or the like they do what they do anywhere. */
+export function onKeys(element: HTMLElement, keys: Readonly<Record<string, () => void>>): void {
+  element.addEventListener("keydown", (event) => {
+    const action = keys[event.key];
+    if (action === undefined || event.ctrlKey || event.metaKey || event.altKey) return;
+    event.preventDefault();
+    action();
+  });
+}
+
+/** Put something else into a place; a link that has the focus keeps it. */
+export function refill(place: HTMLElement, ...content: Child[]): void {
+  const focused = place.contains(document.activeElement) ? document.activeElement?.getAttribute("href") : null;
+  place.replaceChildren(...present(content));
+  if (focused != null) place.querySelector<HTMLAnchorElement>(`a[href="${CSS.escape(focused)}"]`)?.focus();
 }
 
 /** The element of the page with this id. */

@@ -1,3 +1,4 @@
+import type { SettingSchema } from "../api/types";
 import { el } from "./elements";
 
 /** A control with its label above and a hint below. The control has an id. */
@@ -16,6 +17,22 @@ export function field(label: string, control: HTMLElement, hint?: string): HTMLE
 /** A choice of words with their labels; the first is chosen if no other is. */
 export function choice(id: string, options: Record<string, string>, chosen?: string): HTMLSelectElement {
   return el("select", { id }, ...Object.entries(options).map(([value, label]) => el("option", { value, selected: value === chosen }, label)));
+}
+
+/** A control for a value, by its schema: a choice or a text; `more` are further words of a choice with their labels. */
+export function controlOf(schema: SettingSchema, id: string, value: string, more: Record<string, string> = {}): HTMLInputElement | HTMLSelectElement {
+  const words = schema.enum ?? (schema.type === "boolean" ? ["true", "false"] : null);
+  if (words === null) return el("input", { type: "text", id, value, autocomplete: "off" });
+  return choice(id, { ...more, ...Object.fromEntries(words.map((word) => [word, word])) }, value);
+}
+
+/** A form whose fields filter a list; it searches when one of them was changed. */
+export function searchForm(name: string, search: () => void, ...fields: HTMLElement[]): HTMLFormElement {
+  const sent = (event: Event): void => {
+    event.preventDefault();
+    search();
+  };
+  return el("form", { class: "search", role: "search", "aria-label": name, onchange: search, onsubmit: sent }, ...fields);
 }
 
 /** A set of checkboxes. */

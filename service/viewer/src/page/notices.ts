@@ -30,6 +30,11 @@ export function asProblem(error: unknown): Problem {
   return new Problem(0, "The page failed", error instanceof Error ? error.message : String(error), "Reload the page.");
 }
 
+/** Show what was thrown; `again` tries once more what failed. */
+export function report(place: HTMLElement, error: unknown, again?: () => void): void {
+  place.replaceChildren(problemNotice(asProblem(error), again));
+}
+
 /** Announces a text to screen readers. */
 export function announce(message: string): void {
   const status = document.getElementById("status");

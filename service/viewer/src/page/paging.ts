@@ -1,4 +1,5 @@
 import { count } from "../words/numbers";
+import { hashOf } from "./address";
 import { el } from "./elements";
 
 /** `1 to 25 of 312`; without a total `1 to 25`. */
@@ -9,7 +10,7 @@ export function pageWords(offset: number, shown: number, total: number | null): 
 }
 
 /** The offset in an address; 0 if it is none. */
-export function offsetOf(text: string | null): number {
+export function offsetOf(text: string | null | undefined): number {
   const offset = Number(text ?? 0);
   return Number.isSafeInteger(offset) && offset > 0 ? offset : 0;
 }
@@ -23,9 +24,10 @@ export interface Page {
   hasNext: boolean;
 }
 
-/** Links to the page before and the next one; hidden if there is one page. `address` makes the link to an offset. */
-export function pager(page: Page, address: (offset: number) => string): HTMLElement {
+/** Links to the page before and the next one of the list at an address; hidden if there is one page. */
+export function pager(page: Page, words: readonly string[], query: Readonly<Record<string, string>> = {}): HTMLElement {
   const { offset, size, shown, total, hasNext } = page;
+  const address = (to: number): string => hashOf(words, { ...query, offset: to === 0 ? "" : String(to) });
   const step = (label: string, to: number, there: boolean): HTMLElement =>
     there
       ? el("a", { class: "button", href: address(to), rel: to < offset ? "prev" : "next" }, label)

@@ -1,27 +1,54 @@
-import { el } from "./elements";
+import { el, type Child, type Properties } from "./elements";
 
-/** The head of a column: its words, and the class of its cells, such as `only-wide`. */
-export type Head = string | readonly [string, string];
+/** A column of a table. */
+export interface Column<T> {
+  head: string;
+  /** The class of its cells, such as `only-wide`. */
+  kind?: string;
+  /** What it shows of an entry. */
+  cell: (entry: T) => Child | Child[];
+  /** The same in full, where that is too long to be shown. */
+  title?: (entry: T) => string | undefined;
+}
 
-/** A table in a frame. Its name is for screen readers. */
-export function table(name: string, heads: readonly Head[], rows: readonly HTMLElement[]): HTMLElement {
-  const cells = heads.map((head) => {
-    const [words, kind] = typeof head === "string" ? [head, null] : head;
-    return el("th", { scope: "col", class: kind }, words);
-  });
+/**
+ * A table in a frame; the first cell of a row is its head.
+ *
+ * @param name For screen readers.
+ * @param row The attributes of the row of an entry.
+ */
+export function table<T>(name: string, columns: readonly Column<T>[], entries: readonly T[], row: (entry: T) => Properties = () => ({})): HTMLElement {
+  const heads = columns.map(({ head, kind }) => el("th", { scope: "col", class: kind }, head));
+  const rows = entries.map((entry) =>
+    el("tr", row(entry), ...columns.map(({ kind, cell, title }, at) => {
+      const isHead = at === 0;
+      return el(isHead ? "th" : "td", { scope: isHead ? "row" : null, class: kind, title: title?.(entry) }, ...[cell(entry)].flat());
+    })),
+  );
   return el(
     "div",
     { class: "table-frame" },
-    el("table", { class: "rows", "aria-label": name }, el("thead", {}, el("tr", {}, ...cells)), el("tbody", {}, ...rows)),
+    el("table", { class: "rows", "aria-label": name }, el("thead", {}, el("tr", {}, ...heads)), el("tbody", {}, ...rows)),
   );
 }
 
+/** A further line in a cell; null if it says nothing. */
+export function sub(words: string | undefined, ...more: Child[]): HTMLElement | null {
+  return words === undefined || words === "" ? null : el("span", { class: "sub" }, words, ...more);
+}
+
+/** A state in a colour of its own. */
+export function chip(state: string, words = state): HTMLElement {
+  return el("span", { class: `chip chip-${state}` }, words);
+}
+
 /** The same frame around words in place of a table. */
-export function nothing(...words: (Node | string | null)[]): HTMLElement {
+export function nothing(...words: Child[]): HTMLElement {
   return el("div", { class: "table-frame" }, el("p", { class: "nothing" }, ...words));
 }
 
-/** A term and its value, for a list of facts. */
-export function fact(name: string, ...value: (Node | string)[]): HTMLElement[] {
-  return [el("dt", {}, name), el("dd", {}, ...value)];
+/** Terms and their values; null leaves one out. */
+export function facts(properties: Properties, ...rows: (readonly [string, ...Child[]] | null)[]): HTMLElement {
+  const known = rows.filter((row) => row !== null);
+  return el("dl", properties, ...known.flatMap(([name, ...value]) => [el("dt", {}, name), el("dd", {}, ...value)]));
 }

@@ -1,14 +1,11 @@
 /** What the page and its views know of each other. */
 
-import type { Problem } from "../api/requests";
 import type { Address } from "./address";
 
-/** The calls of a view to the page. */
-export interface Hooks {
-  /** The list no longer shows the job's state. */
-  onChange: () => void;
-  onProblem: (problem: Problem) => void;
-}
+/** The event of the document when a job was made, changed or removed. */
+export const JOBS_CHANGED = "jobs-changed";
+
+export const jobsChanged = (): void => void document.dispatchEvent(new Event(JOBS_CHANGED));
 
 /** A view that is shown. */
 export interface View {
@@ -17,4 +14,5 @@ export interface View {
   leave(): void;
 }
 
-export type Show = (place: HTMLElement, address: Address, hooks: Hooks) => View;
+/** Shows what an address names, once the view follows it. */
+export type Show = (place: HTMLElement, address: Address) => View;

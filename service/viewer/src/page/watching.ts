@@ -1,6 +1,5 @@
 import { el } from "./elements";
-import { asProblem, problemNotice } from "./notices";
-import type { Hooks } from "./view";
+import { asProblem, report } from "./notices";
 
 /** A view, or a part of one, that looks at the service again and again until it is left. */
 export abstract class Watching {
@@ -11,10 +10,7 @@ export abstract class Watching {
   private isLeft = false;
 
   /** @param refreshMs Pause between two looks. */
-  constructor(
-    protected readonly hooks: Hooks,
-    private readonly refreshMs: number,
-  ) {}
+  constructor(private readonly refreshMs: number) {}
 
   leave(): void {
     this.isLeft = true;
@@ -43,8 +39,7 @@ export abstract class Watching {
       if (signal.aborted) return;
       const problem = asProblem(error);
       // a notice that is drawn anew is read out anew
-      if (isAsked || this.note.childElementCount === 0) this.note.replaceChildren(problemNotice(problem, () => void this.load()));
-      this.hooks.onProblem(problem);
+      if (isAsked || this.note.childElementCount === 0) report(this.note, problem, () => void this.load());
       // what is shown stays; it is looked at again until the service is back
       if (problem.status === 0 && !isAsked) this.wait();
     }

@@ -63,19 +63,18 @@ const RAMP = ["#3e4a89", "#31688e", "#26828e", "#1f9e89", "#35b779", "#6ece58", 
 /** Most classes of a colouring. */
 export const MOST_CLASSES = 9;
 
-/** The colours of a colouring, in the shader's order. */
-export function palette(colouring: PointColouring): readonly string[] {
-  switch (colouring) {
-    case "residual":
-      return RESIDUALS.map(({ colour }) => colour);
-    case "plane":
-      return [...CYCLE, NONE];
-    case "class":
-      return CLASSES.map(({ colour }) => colour);
-    case "height":
-      return RAMP;
-  }
-}
+const plain = (colour: string): PointClass => ({ label: "", colour });
+
+/** The classes of each colouring, in the shader's order. */
+const OF: Record<PointColouring, readonly PointClass[]> = {
+  residual: RESIDUALS,
+  plane: [...CYCLE.map(plain), plain(NONE)],
+  class: CLASSES,
+  height: RAMP.map(plain),
+};
+
+/** The colours of a colouring, in the same order. */
+export const palette = (colouring: PointColouring): string[] => OF[colouring].map(({ colour }) => colour);
 
 /** The number of a class code among the classes. */
 export function classNumber(code: number): number {
@@ -104,24 +103,17 @@ export function legendLines(
   counts: Readonly<Record<string, number>>,
   [low, high]: readonly [number, number],
 ): LegendLine[] {
-  switch (colouring) {
-    case "residual":
-      return RESIDUALS.map(({ label, colour }, i) => ({ colours: [colour], label, numbers: [i], count: null }));
-    case "plane":
-      return [
-        { colours: CYCLE, label: "planes of each building", numbers: CYCLE.map((_, i) => i), count: null },
-        { colours: [NONE], label: "no model", numbers: [CYCLE.length], count: null },
-      ];
-    case "class": {
-      const tally = CLASSES.map(() => 0);
-      for (const [code, n] of Object.entries(counts)) tally[classNumber(Number(code))] += n;
-      return CLASSES.flatMap(({ label, colour }, i) =>
-        tally[i] > 0 ? [{ colours: [colour], label, numbers: [i], count: tally[i] }] : [],
-      );
-    }
-    case "height":
-      return [
-        { colours: RAMP, label: `${measure(low, 0, "m")} to ${measure(high, 0, "m")}`, numbers: [], count: null },
-      ];
+  if (colouring === "height") {
+    return [{ colours: RAMP, label: `${measure(low, 0, "m")} to ${measure(high, 0, "m")}`, numbers: [], count: null }];
   }
+  if (colouring === "plane") {
+    return [
+      { colours: CYCLE, label: "planes of each building", numbers: CYCLE.map((_, i) => i), count: null },
+      { colours: [NONE], label: "no model", numbers: [CYCLE.length], count: null },
+    ];
+  }
+  const tally = CLASSES.map(() => 0);
+  for (const [code, n] of Object.entries(counts)) tally[classNumber(Number(code))] += n;
+  const lines = OF[colouring].map(({ label, colour }, i) => ({ colours: [colour], label, numbers: [i], count: colouring === "class" ? tally[i] : null }));
+  return lines.filter(({ count }) => count !== 0);
 }

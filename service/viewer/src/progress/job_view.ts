@@ -3,11 +3,11 @@ import { getJson, isOver, pathOfJob, Problem } from "../api/requests";
 import type { JobEvent, StatusInfo } from "../api/types";
 import { downloadList } from "../jobs/downloads";
 import { cancellation, jobMenu, retry } from "../jobs/job_actions";
-import { failureRemedy, MODELLED, titleOf } from "../jobs/job_words";
+import { failureRemedy, hasModels, titleOf } from "../jobs/job_words";
 import type { Place } from "../page/address";
-import { el } from "../page/elements";
-import { announce, asProblem, problemNotice, warningNotice } from "../page/notices";
-import type { Hooks } from "../page/view";
+import { button, el } from "../page/elements";
+import { announce, asProblem, problemNotice, report, warningNotice } from "../page/notices";
+import { jobsChanged, type View } from "../page/view";
 import { count, duration } from "../words/numbers";
 import { BuildingsSoFar } from "./so_far";
 import { stageNamed, stagesOf, type Stage } from "./stages";
@@ -16,8 +16,8 @@ import "./job_view.css";
 /** Stages in which a job has some of its buildings. */
 const HAS_MODELS = new Set(["reconstruct", "publish", "formats", "outputs"]);
 
-/** Show a job: its progress, its failure or its results. Returns a function that ends the view. */
-export function showJob(place: HTMLElement, named: Place, hooks: Hooks): () => void {
+/** Show a job: its progress, its failure or its results, which follow the address by themselves. */
+export function showJob(place: HTMLElement, named: Place): View {
   const calledOff = new AbortController();
   let leaveResults: () => void = () => undefined;
   const path = pathOfJob(named.job);
@@ -26,21 +26,21 @@ export function showJob(place: HTMLElement, named: Place, hooks: Hooks): () => v
     const job = await getJson<StatusInfo>(path, { signal: calledOff.signal });
     if (calledOff.signal.aborted) return;
     document.title = `${titleOf(job)} · gablework`;
-    if (job.status === "successful" && !MODELLED.has(job.processID ?? "reconstruct")) {
-      place.replaceChildren(await files(job, path, hooks, calledOff.signal));
+    if (job.status === "successful" && !hasModels(job)) {
+      place.replaceChildren(await files(job, path, calledOff.signal));
     } else if (job.status === "successful") {
       // the 3D library is loaded only if there is something to draw
       const { showResults } = await import("../results/results_view");
       if (calledOff.signal.aborted) return;
-      leaveResults = showResults(place, job, named, hooks);
+      leaveResults = showResults(place, job, named);
     } else if (isOver(job.status)) {
-      place.replaceChildren(ended(job, hooks));
+      place.replaceChildren(ended(job));
     } else {
       const soFar = job.processID === "reconstruct" ? new BuildingsSoFar(path, calledOff.signal) : null;
-      const progress = new ProgressView(job, soFar, hooks);
+      const progress = new ProgressView(job, soFar);
       place.replaceChildren(progress.element);
       await progress.follow(path, calledOff.signal);
-      hooks.onChange();
+      jobsChanged();
       await look();
     }
   };
@@ -49,51 +49,48 @@ export function showJob(place: HTMLElement, named: Place, hooks: Hooks): () => v
   const begin = (): void => {
     look().catch((error: unknown) => {
       if (calledOff.signal.aborted) return;
-      const problem = asProblem(error);
-      if (problem.kind === "no-such-job") {
+      if (asProblem(error).kind === "no-such-job") {
         document.title = "No such job · gablework";
         place.replaceChildren(gone());
         return;
       }
-      place.replaceChildren(el("div", { class: "card" }, problemNotice(problem, begin)));
-      hooks.onProblem(problem);
+      const card = el("div", { class: "card" });
+      place.replaceChildren(card);
+      report(card, error, begin);
     });
   };
   begin();
-  return () => {
+  const leave = (): void => {
     calledOff.abort();
     leaveResults();
   };
+  return { follow: () => undefined, leave };
 }
 
 /** A job whose results are files without buildings. */
-async function files(job: StatusInfo, path: string, hooks: Hooks, signal: AbortSignal): Promise<HTMLElement> {
-  const list = await downloadList(path, null, signal);
-  return el("div", { class: "card" }, heading(job, hooks), el("p", {}, job.message ?? ""), list);
+async function files(job: StatusInfo, path: string, signal: AbortSignal): Promise<HTMLElement> {
+  const list = await downloadList({ jobPath: path, method: null }, signal);
+  return el("div", { class: "card" }, heading(job), el("p", {}, job.message ?? ""), list);
 }
 
 /** A job that is over without results. */
-function ended(job: StatusInfo, hooks: Hooks): HTMLElement {
+function ended(job: StatusInfo): HTMLElement {
   const failure = job.exception;
   const notice =
     job.status === "failed"
       ? problemNotice(new Problem(0, failure?.title ?? "The job failed", failure?.detail ?? job.message ?? "", failureRemedy(job)))
       : el("p", {}, "This job was cancelled; its files are removed. Its tiles can be used again as long as the service keeps them.");
   const note = el("div");
-  const again = el("button", { type: "button", class: "primary" }, "Try again…");
-  again.addEventListener("click", () => {
+  const again = (): void => {
     note.replaceChildren();
-    retry(job, hooks).catch((error: unknown) => {
-      const problem = asProblem(error);
-      note.replaceChildren(problemNotice(problem));
-      hooks.onProblem(problem);
-    });
-  });
-  return el("div", { class: "card" }, heading(job, hooks), notice, note, el("div", { class: "actions" }, again));
+    retry(job).catch((error: unknown) => report(note, error));
+  };
+  const actions = el("div", { class: "actions" }, button("Try again…", again, { class: "primary" }));
+  return el("div", { class: "card" }, heading(job), notice, note, actions);
 }
 
-function heading(job: StatusInfo, hooks: Hooks): HTMLElement {
-  return el("div", { class: "job-head" }, el("h1", {}, titleOf(job)), jobMenu(job, hooks));
+function heading(job: StatusInfo, id?: string): HTMLElement {
+  return el("div", { class: "job-head" }, el("h1", { id }, titleOf(job)), jobMenu(job));
 }
 
 /** A job that the service does not have: its address is old. */
@@ -117,38 +114,40 @@ class ProgressView {
   private readonly elapsed = el("span", { class: "elapsed" });
   private readonly stages = el("ol", { class: "stages" });
   private readonly shown: string[] = [];
-  private readonly rows = new Map<string, { row: HTMLElement; figure: HTMLElement }>();
+  private known: Stage[];
+  /** How far each stage is. */
+  private readonly figures = new Map<string, string>();
   private readonly started: number;
 
   constructor(
     job: StatusInfo,
     private readonly soFar: BuildingsSoFar | null,
-    hooks: Hooks,
   ) {
     this.started = Date.parse(job.started ?? job.created ?? new Date().toISOString());
-    for (const stage of stagesOf(job)) this.addStage(stage);
-    const button = el("button", { type: "button", class: "quiet" }, "Cancel the job");
-    button.addEventListener("click", () => {
+    this.known = stagesOf(job);
+    const cancel = (): void => {
       // a second request would remove the job that the first has stopped
-      if (button.getAttribute("aria-disabled") === "true") return;
-      button.setAttribute("aria-disabled", "true"); // not `disabled`: it keeps the focus
-      cancellation(job, hooks)
-        .catch((error: unknown) => this.waiting.replaceChildren(problemNotice(asProblem(error))))
-        .finally(() => button.removeAttribute("aria-disabled"));
-    });
+      if (stop.getAttribute("aria-disabled") === "true") return;
+      stop.setAttribute("aria-disabled", "true"); // not `disabled`: it keeps the focus
+      cancellation(job)
+        .catch((error: unknown) => report(this.waiting, error))
+        .finally(() => stop.removeAttribute("aria-disabled"));
+    };
+    const stop = button("Cancel the job", cancel, { class: "quiet" });
     this.element = el(
       "section",
       { class: "card progress", "aria-labelledby": "progress-title" },
-      el("div", { class: "job-head" }, el("h1", { id: "progress-title" }, titleOf(job)), jobMenu(job, hooks)),
+      heading(job, "progress-title"),
       el("div", { class: "progress-line" }, this.bar, this.percent),
       el("div", { class: "progress-words" }, this.message, this.elapsed),
       this.waiting,
       this.stages,
       soFar?.element ?? "",
       this.warnings,
-      el("div", { class: "actions" }, button),
+      el("div", { class: "actions" }, stop),
     );
     this.set(job.progress ?? 0, job.message ?? "");
+    this.drawStages("");
     if (job.stage !== undefined) this.enter(job.stage);
   }
 
@@ -196,35 +195,21 @@ class ProgressView {
 
   private enter(stage: string, event?: JobEvent): void {
     if (HAS_MODELS.has(stage)) this.soFar?.begin();
-    if (!this.rows.has(stage)) this.addStage(stageNamed(stage), stage === "compile");
-    let before = true;
-    for (const [name, { row, figure }] of this.rows) {
-      if (name === stage) {
-        before = false;
-        row.className = "stage stage-now";
-        row.setAttribute("aria-current", "step");
-        if (event !== undefined && event.total > 1) figure.textContent = `${count(event.done)} of ${count(event.total)} ${stageNamed(name).unit}`;
-      } else {
-        row.className = before ? "stage stage-done" : "stage";
-        row.removeAttribute("aria-current");
-      }
-    }
+    const one = stageNamed(stage);
+    // what is compiled comes before all else
+    if (!this.known.some(({ name }) => name === stage)) this.known = stage === "compile" ? [one, ...this.known] : [...this.known, one];
+    if (event !== undefined && event.total > 1) this.figures.set(stage, `${count(event.done)} of ${count(event.total)} ${one.unit}`);
+    this.drawStages(stage);
   }
 
-  private addStage({ name, words }: Stage, isFirst = false): void {
-    const figure = el("span", { class: "stage-figure" });
-    const row = el("li", { class: "stage" }, el("span", { class: "stage-name" }, words), figure);
-    if (isFirst) {
-      // rows are in the order of the stages
-      const others = [...this.rows];
-      this.rows.clear();
-      this.rows.set(name, { row, figure });
-      for (const [known, place] of others) this.rows.set(known, place);
-      this.stages.prepend(row);
-      return;
-    }
-    this.rows.set(name, { row, figure });
-    this.stages.append(row);
+  private drawStages(stage: string): void {
+    const now = this.known.findIndex(({ name }) => name === stage);
+    const rows = this.known.map(({ name, words }, i) => {
+      const kind = i === now ? "stage stage-now" : i < now ? "stage stage-done" : "stage";
+      const parts = [el("span", { class: "stage-name" }, words), el("span", { class: "stage-figure" }, this.figures.get(name))];
+      return el("li", { class: kind, "aria-current": i === now ? "step" : null }, ...parts);
+    });
+    this.stages.replaceChildren(...rows);
   }
 
   private tick(): void {

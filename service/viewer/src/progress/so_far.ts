@@ -1,6 +1,7 @@
+import { waited } from "../api/event_stream";
 import { getJson } from "../api/requests";
 import type { Feature } from "../api/types";
-import { ringsOf, type Point } from "../models/rings";
+import { boxAround, ringsOf, united, type Box, type Point } from "../models/plan";
 import { el, svg } from "../page/elements";
 import { counted } from "../words/numbers";
 import { CATEGORIES, categoryOf } from "../words/roof_types";
@@ -9,8 +10,6 @@ const PAUSE_MS = 3000;
 const PAGE = 1000; // buildings
 const MOST_DRAWN = 5000; // more outlines than that make the page slow; they are only counted
 const MARGIN = 0.03; // of the longer side
-
-type Bounds = [west: number, south: number, east: number, north: number];
 
 interface Page {
   complete: boolean;
@@ -26,18 +25,6 @@ export function pathOf(rings: Point[][], [x0, y0]: Point): string {
     .join("");
 }
 
-/** Bounds that also hold these rings. */
-export function grown(bounds: Bounds | null, rings: Point[][]): Bounds | null {
-  let found = bounds;
-  for (const [x, y] of rings.flat()) {
-    found =
-      found === null
-        ? [x, y, x, y]
-        : [Math.min(found[0], x), Math.min(found[1], y), Math.max(found[2], x), Math.max(found[3], y)];
-  }
-  return found;
-}
-
 /** The outlines of a running job's buildings, seen from above, as they are modelled. */
 export class BuildingsSoFar {
   private readonly plan = svg("svg", { role: "img", "aria-label": "Outlines of the buildings so far, seen from above" });
@@ -47,7 +34,7 @@ export class BuildingsSoFar {
   private known = 0;
   private drawn = 0;
   private origin: Point | null = null;
-  private bounds: Bounds | null = null;
+  private bounds: Box = boxAround([]);
   private begun = false;
 
   constructor(
@@ -59,14 +46,14 @@ export class BuildingsSoFar {
   begin(): void {
     if (this.begun) return;
     this.begun = true;
-    void this.follow();
+    this.follow().catch(() => undefined); // the page shows something else
   }
 
   private async follow(): Promise<void> {
     // where the answer is a problem, the events of the job tell it, too
     while (!(await this.ask().catch(() => false))) {
-      await new Promise((resolve) => setTimeout(resolve, PAUSE_MS));
-      if (this.signal.aborted || !this.element.isConnected) return;
+      await waited(PAUSE_MS, this.signal);
+      if (!this.element.isConnected) return;
     }
   }
 
@@ -86,7 +73,8 @@ export class BuildingsSoFar {
   private clear(attempt: number): void {
     this.attempt = attempt;
     this.known = this.drawn = 0;
-    this.origin = this.bounds = null;
+    this.origin = null;
+    this.bounds = boxAround([]);
     this.plan.replaceChildren();
   }
 
@@ -95,7 +83,7 @@ export class BuildingsSoFar {
     this.known += page.features.length;
     this.element.hidden = this.known === 0;
     this.words.textContent = `${counted(this.known, "building")} so far`;
-    if (this.bounds === null || this.origin === null) return;
+    if (this.origin === null) return;
     const [west, south, east, north] = this.bounds;
     const margin = MARGIN * Math.max(east - west, north - south);
     const corner = [west - this.origin[0] - margin, this.origin[1] - north - margin];
@@ -108,7 +96,7 @@ export class BuildingsSoFar {
     if (first === undefined || this.drawn >= MOST_DRAWN) return;
     this.drawn += 1;
     this.origin ??= first;
-    this.bounds = grown(this.bounds, rings);
+    this.bounds = united([this.bounds, boxAround(rings.flat())]);
     const { colour } = CATEGORIES[categoryOf(properties["status"], properties["roof_type"])];
     this.plan.append(svg("path", { d: pathOf(rings, this.origin), fill: colour, "fill-rule": "evenodd" }));
   }

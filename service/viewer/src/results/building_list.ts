@@ -4,11 +4,10 @@ import { el, swatch } from "../page/elements";
 import { count } from "../words/numbers";
 import { reasonWords } from "../words/reasons";
 import { CATEGORIES } from "../words/roof_types";
-import { Rows } from "./rows";
 import "./building_list.css";
 
 const ROW_PX = 50;
-const REASON_PX = 18; // a further line for the reason
+const REASON_PX = 18; // a further line of all rows if there is a reason among them
 const MORE = 6; // rows beyond the window, so that a small step shows no gap
 
 /**
@@ -23,7 +22,7 @@ export class BuildingList {
   private readonly drawn = new Map<string, HTMLElement>();
   private objects: readonly Listed[] = [];
   private places = new Map<string, number>();
-  private rows = new Rows([]);
+  private rowPx = ROW_PX;
   private figure: FigureName | null = null;
   private current: string | null = null;
   private scrolled = 0;
@@ -54,8 +53,8 @@ export class BuildingList {
     this.objects = objects;
     this.figure = figure;
     this.places = new Map(objects.map(({ id }, place) => [id, place]));
-    this.rows = new Rows(objects.map(({ reason }) => (reason === null ? ROW_PX : ROW_PX + REASON_PX)));
-    this.list.style.height = `${this.rows.height}px`;
+    this.rowPx = objects.every(({ reason }) => reason === null) ? ROW_PX : ROW_PX + REASON_PX;
+    this.list.style.height = `${this.rowPx * objects.length}px`;
     this.list.hidden = objects.length === 0;
     this.empty.hidden = objects.length > 0;
     this.empty.textContent = nothing;
@@ -102,7 +101,8 @@ export class BuildingList {
   /** Put the rows of the window into the page, in their order, and the row that has the focus. */
   private draw(): void {
     const { scrollTop, clientHeight } = this.element;
-    const [from, to] = this.rows.within(scrollTop, scrollTop + clientHeight, MORE);
+    const from = Math.max(Math.floor(scrollTop / this.rowPx) - MORE, 0);
+    const to = Math.min(Math.ceil((scrollTop + clientHeight) / this.rowPx) + MORE, this.objects.length);
     const wanted = new Set<number>();
     const kept = this.current === null ? undefined : this.places.get(this.current);
     if (kept !== undefined) wanted.add(kept);
@@ -125,18 +125,14 @@ export class BuildingList {
 
   private row(place: number): HTMLElement {
     const { id, category, reason, reasonDetail, figures } = this.objects[place];
-    const usual = ([["height"], ["area"]] as const).map(([name]) => figureWords(name, figures));
+    const usual = [figureWords("height", figures), figureWords("area", figures)].filter((words) => words !== null);
     const extra = this.figure === null || this.figure === "height" || this.figure === "area" ? null : this.figure;
     const link = el(
       "a",
       { class: "building", href: this.address(id), tabindex: id === this.current ? 0 : -1 },
       swatch(category),
       el("span", { class: "building-type" }, CATEGORIES[category].label),
-      el(
-        "span",
-        { class: "building-figures", title: "Height and footprint" },
-        usual.filter((words) => words !== null).join(" · "),
-      ),
+      el("span", { class: "building-figures", title: "Height and footprint" }, usual.join(" · ")),
       el("code", { class: "building-id", title: id }, id),
       extra === null
         ? null
@@ -147,8 +143,8 @@ export class BuildingList {
     );
     const row = el("li", { "aria-setsize": this.objects.length, "aria-posinset": place + 1 }, link);
     row.dataset["id"] = id;
-    row.style.top = `${this.rows.top(place)}px`;
-    row.style.height = `${this.rows.bottom(place) - this.rows.top(place)}px`;
+    row.style.top = `${this.rowPx * place}px`;
+    row.style.height = `${this.rowPx}px`;
     return row;
   }
 
@@ -165,7 +161,7 @@ export class BuildingList {
     const place = this.places.get(id);
     if (place === undefined) return;
     const { scrollTop, clientHeight } = this.element;
-    const [top, bottom] = [this.rows.top(place), this.rows.bottom(place)];
+    const [top, bottom] = [this.rowPx * place, this.rowPx * (place + 1)];
     if (top < scrollTop) this.element.scrollTop = top;
     else if (bottom > scrollTop + clientHeight) this.element.scrollTop = bottom - clientHeight;
     this.draw();
@@ -174,13 +170,13 @@ export class BuildingList {
   private typed(event: KeyboardEvent): void {
     const at = this.current === null ? undefined : this.places.get(this.current);
     if (at === undefined || event.ctrlKey || event.metaKey || event.altKey) return;
-    const page = this.element.clientHeight;
-    const last = this.rows.count - 1;
+    const page = Math.floor(this.element.clientHeight / this.rowPx);
+    const last = this.objects.length - 1;
     const aim = {
       ArrowDown: at + 1,
       ArrowUp: at - 1,
-      PageDown: this.rows.at(this.rows.top(at) + page),
-      PageUp: this.rows.at(this.rows.top(at) - page),
+      PageDown: at + page,
+      PageUp: at - page,
       Home: 0,
       End: last,
     }[event.key];

@@ -1,7 +1,8 @@
 import { COLUMNS, factorOf } from "../models/columns";
 import { FIGURE_NAMES, FIGURES, FLAG_NAMES, FLAGS, type FigureName } from "../models/figures";
 import { isFiltered, SORTS, STATUSES, unfiltered, type Range, type Sort, type Wanted } from "../models/selection";
-import { el, swatch } from "../page/elements";
+import { button, el, setPressed, swatch } from "../page/elements";
+import { Tick } from "../page/tick";
 import { capital } from "../words/fields";
 import { count } from "../words/numbers";
 import { reasonWords } from "../words/reasons";
@@ -35,7 +36,7 @@ export class FilterPanel {
   readonly element: HTMLElement;
   private wanted: Wanted | null = null;
   private readonly tally = el("span", { class: "tally" });
-  private readonly clear = el("button", { type: "button", class: "quiet" }, "Clear filters");
+  private readonly clear = button("Clear filters", () => this.unfilter(), { class: "quiet" });
   private readonly text = el("input", {
     type: "search",
     id: "list-search",
@@ -43,44 +44,34 @@ export class FilterPanel {
     placeholder: "Search ids and reasons",
     autocomplete: "off",
     spellcheck: "false",
+    oninput: () => this.change({ text: this.text.value }),
   });
   private readonly sort = el(
     "select",
-    { "aria-label": "Sort by" },
+    { "aria-label": "Sort by", onchange: () => this.change({ sort: this.sort.value as Sort }) },
     ...SORTS.map((name) => el("option", { value: name }, SORT_WORDS[name])),
   );
-  private readonly direction = el("button", { type: "button", class: "direction" });
-  private readonly buildings = el("button", { type: "button" });
-  private readonly without = el("button", { type: "button" });
+  private readonly direction = button("", () => this.change({ descending: !this.given.descending }), { class: "direction" });
+  private readonly buildings = button("", () => this.showOnly(BUILDINGS));
+  private readonly without = button("", () => this.showOnly(WITHOUT));
   private readonly summary = el("summary", {}, "Filters");
   private readonly more: HTMLDetailsElement;
   private readonly roofGroup: HTMLElement;
-  private readonly categories = new Map<Category, Box>();
-  private readonly status = new Map<keyof typeof STATUSES, Box>();
-  private readonly reasons = new Map<string, Box>();
+  private readonly categories: Map<Category, Tick>;
+  private readonly status: Map<keyof typeof STATUSES, Tick>;
+  private readonly reasons = new Map<string, Tick>();
   private readonly reasonBoxes = el("div", { class: "filter-boxes" });
   private readonly reasonGroup = el("fieldset", { class: "filter" }, el("legend", {}, "Reason"), this.reasonBoxes);
-  private readonly flags = new Map(FLAG_NAMES.map((name) => [name, new Box(FLAGS[name], () => this.toggleFlag(name))]));
+  private readonly flags = new Map(FLAG_NAMES.map((name) => [name, new Tick(FLAGS[name], (on) => this.change({ flags: changed(this.given.flags, [name], on) }))]));
   private readonly bounds = new Map(FIGURE_NAMES.map((name) => [name, [this.bound(name, 0), this.bound(name, 1)] as const]));
 
   constructor(private readonly onChange: (wanted: Wanted) => void) {
-    for (const name of STATUSES.ok.categories) this.categories.set(name, this.categoryBox(name));
-    for (const name of Object.keys(STATUSES) as (keyof typeof STATUSES)[]) {
-      const { label, categories } = STATUSES[name];
-      const box = new Box(label, (on) => this.change({ hidden: changed(this.given.hidden, categories, !on) }));
-      if (categories.length === 1) box.mark(swatch(categories[0]));
-      this.status.set(name, box);
-    }
-    this.text.addEventListener("input", () => this.change({ text: this.text.value }));
-    this.sort.addEventListener("change", () => this.change({ sort: this.sort.value as Sort }));
-    this.direction.addEventListener("click", () => this.change({ descending: !this.given.descending }));
-    this.clear.addEventListener("click", () => {
-      this.onChange(unfiltered(this.given));
-      this.text.focus();
-    });
-    this.buildings.addEventListener("click", () => this.showOnly(BUILDINGS));
-    this.without.addEventListener("click", () => this.showOnly(WITHOUT));
-    const group = (title: string, ...boxes: Box[]): HTMLElement =>
+    const showing = (label: string, categories: Category[]): Tick =>
+      new Tick(label, (on) => this.change({ hidden: changed(this.given.hidden, categories, !on) }), categories.length === 1 ? [swatch(categories[0])] : []);
+    this.categories = new Map(STATUSES.ok.categories.map((name) => [name, showing(CATEGORIES[name].label, [name])]));
+    const statuses = Object.keys(STATUSES) as (keyof typeof STATUSES)[];
+    this.status = new Map(statuses.map((name) => [name, showing(STATUSES[name].label, STATUSES[name].categories)]));
+    const group = (title: string, ...boxes: Tick[]): HTMLElement =>
       el("fieldset", { class: "filter" }, el("legend", {}, title), el("div", { class: "filter-boxes" }, ...boxes.map(({ row }) => row)));
     this.roofGroup = group("Roof type", ...this.categories.values());
     this.more = el(
@@ -122,11 +113,10 @@ export class FilterPanel {
     this.direction.title = capital(order);
     const isShown = (chosen: Category[]): boolean =>
       [...categories.keys()].every((name) => hidden.has(name) !== chosen.includes(name));
-    this.buildings.setAttribute("aria-pressed", String(isShown(BUILDINGS)));
-    this.without.setAttribute("aria-pressed", String(isShown(WITHOUT)));
     const sum = (chosen: Category[]): number => chosen.reduce((n, name) => n + (categories.get(name) ?? 0), 0);
-    for (const [button, label, chosen] of [[this.buildings, "Buildings", BUILDINGS], [this.without, "Without a model", WITHOUT]] as const) {
-      button.replaceChildren(`${label} `, el("span", { class: "tally" }, count(sum(chosen))));
+    for (const [choice, label, chosen] of [[this.buildings, "Buildings", BUILDINGS], [this.without, "Without a model", WITHOUT]] as const) {
+      setPressed(choice, isShown(chosen));
+      choice.replaceChildren(`${label} `, el("span", { class: "tally" }, count(sum(chosen))));
     }
     for (const [name, box] of this.categories) {
       box.set(!hidden.has(name), categories.get(name) ?? 0);
@@ -154,7 +144,7 @@ export class FilterPanel {
     for (const [name, n] of reasons) known.set(name, n);
     for (const name of known.keys()) {
       if (!this.reasons.has(name)) {
-        this.reasons.set(name, new Box(capital(reasonWords(name)), () => this.toggleReason(name)));
+        this.reasons.set(name, new Tick(capital(reasonWords(name)), (on) => this.change({ reasons: changed(this.given.reasons, [name], on) })));
       }
     }
     const order = [...known].sort(([a, m], [b, n]) => n - m || (a < b ? -1 : 1)).map(([name]) => name);
@@ -180,24 +170,15 @@ export class FilterPanel {
     this.onChange({ ...this.given, ...changes });
   }
 
+  private unfilter(): void {
+    this.onChange(unfiltered(this.given));
+    this.text.focus();
+  }
+
   private showOnly(categories: Category[]): void {
     const hidden = new Set((Object.keys(CATEGORIES) as Category[]).filter((name) => !categories.includes(name)));
     if (categories === WITHOUT) this.more.open = true; // the reasons with their numbers
     this.change({ hidden, reasons: new Set() });
-  }
-
-  private categoryBox(name: Category): Box {
-    const box = new Box(CATEGORIES[name].label, (on) => this.change({ hidden: changed(this.given.hidden, [name], !on) }));
-    box.mark(swatch(name));
-    return box;
-  }
-
-  private toggleReason(name: string): void {
-    this.change({ reasons: changed(this.given.reasons, [name], !this.given.reasons.has(name)) });
-  }
-
-  private toggleFlag(name: (typeof FLAG_NAMES)[number]): void {
-    this.change({ flags: changed(this.given.flags, [name], !this.given.flags.has(name)) });
   }
 
   // --- ranges
@@ -230,30 +211,8 @@ export class FilterPanel {
   }
 }
 
-/** A checkbox with a label and a number. */
-class Box {
-  readonly row: HTMLElement;
-  private readonly box = el("input", { type: "checkbox" });
-  private readonly tally = el("span", { class: "tally" });
-
-  constructor(label: string, onToggle: (on: boolean) => void) {
-    this.box.addEventListener("change", () => onToggle(this.box.checked));
-    this.row = el("label", {}, this.box, el("span", {}, label), this.tally);
-  }
-
-  mark(sign: HTMLElement): void {
-    this.box.after(sign);
-  }
-
-  set(checked: boolean, n: number | null, partly = false): void {
-    this.box.checked = checked;
-    this.box.indeterminate = partly;
-    this.tally.textContent = n === null ? "" : count(n);
-  }
-}
-
 /** A set with some members added or removed. */
-function changed<T>(set: ReadonlySet<T>, members: readonly T[], added: boolean): Set<T> {
+export function changed<T>(set: ReadonlySet<T>, members: readonly T[], added: boolean): Set<T> {
   const result = new Set(set);
   for (const member of members) {
     if (added) result.add(member);

@@ -1,5 +1,5 @@
 import { levelWords } from "../models/levels_of_detail";
-import { el } from "../page/elements";
+import { button, el, setPressed } from "../page/elements";
 
 /** Buttons for the levels of detail of the shown models; hidden if there is nothing to choose. */
 export class LevelChoice {
@@ -11,7 +11,7 @@ export class LevelChoice {
   offer(lods: readonly string[]): void {
     this.element.replaceChildren(
       ...lods.map((lod) =>
-        el("button", { type: "button", value: lod, title: levelWords(lod), onclick: () => this.onChoice(lod) }, `LoD${lod}`),
+        button(`LoD${lod}`, () => this.onChoice(lod), { value: lod, title: levelWords(lod) }),
       ),
     );
     this.element.hidden = lods.length < 2;
@@ -20,8 +20,6 @@ export class LevelChoice {
 
   /** Mark the shown level. */
   mark(lod: string): void {
-    for (const button of this.element.querySelectorAll("button")) {
-      button.setAttribute("aria-pressed", String(button.value === lod));
-    }
+    for (const one of this.element.querySelectorAll("button")) setPressed(one, one.value === lod);
   }
 }

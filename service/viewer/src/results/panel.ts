@@ -1,6 +1,6 @@
 /** The panel beside the models: the list of objects, or the record of one of them. */
 
-import { el } from "../page/elements";
+import { button, el } from "../page/elements";
 import type { BuildingList } from "./building_list";
 
 export class Panel {
@@ -39,7 +39,7 @@ export class Panel {
       const next = this.list.beside(id, by);
       if (next !== null) this.open(next);
     };
-    const back = el("button", { type: "button", class: "quiet", onclick: () => this.open(null) }, "← All buildings");
+    const back = button("← All buildings", () => this.open(null), { class: "quiet" });
     const body = el("div", { class: "record", "aria-live": "polite" });
     this.element.replaceChildren(
       el(
@@ -47,8 +47,8 @@ export class Panel {
         { class: "record-bar" },
         back,
         el("span", { class: "spacer" }),
-        el("button", { type: "button", class: "quiet", "aria-label": "Previous building", onclick: step(-1) }, "‹"),
-        el("button", { type: "button", class: "quiet", "aria-label": "Next building", onclick: step(1) }, "›"),
+        button("‹", step(-1), { class: "quiet", "aria-label": "Previous building" }),
+        button("›", step(1), { class: "quiet", "aria-label": "Next building" }),
       ),
       body,
     );

@@ -1,134 +1,133 @@
-import { getJson, ofRun, type Problem } from "../api/requests";
+/** The record of one object, beside the models. */
+
+import { buildingOf, getJson, type Run } from "../api/requests";
 import type { Feature } from "../api/types";
 import { dossierLink, followDossier } from "../dossier/dossier_link";
 import { downloadLink } from "../jobs/downloads";
+import type { Listed } from "../models/batching";
 import { COLUMN_NAMES, COLUMNS, shown } from "../models/columns";
+import { FIGURES, figureWords, type FigureName } from "../models/figures";
 import { el, swatch } from "../page/elements";
-import { asProblem, problemNotice, warningNotice } from "../page/notices";
-import { fact } from "../page/tables";
+import { report, warningNotice } from "../page/notices";
+import { facts } from "../page/tables";
 import { capital } from "../words/fields";
 import { measure } from "../words/numbers";
 import { reasonWords } from "../words/reasons";
-import { CATEGORIES, categoryOf } from "../words/roof_types";
+import { CATEGORIES, categoryOf, type Category } from "../words/roof_types";
 
-type Record_ = Feature["properties"];
+type Properties = Feature["properties"];
 
-/** The most important columns of the record, by section; the file has all of them. */
-function tables(properties: Record_, elevationUnitM: number): HTMLElement[] {
-  const sections = [...new Set(COLUMN_NAMES.map((name) => COLUMNS[name].section))];
-  return sections.map((section) => {
-    const names = COLUMN_NAMES.filter((name) => COLUMNS[name].section === section);
-    const rows = names.flatMap((name) => fact(COLUMNS[name].label, shown(name, properties[name], elevationUnitM)));
-    return el("section", {}, el("h3", {}, section), el("dl", {}, ...rows));
-  });
-}
-
-/** Show the record of one building; returns a function that stops the loading. */
-export function showRecord(
-  place: HTMLElement,
-  jobPath: string,
-  method: string | null,
-  buildingId: string,
-  elevationUnitM: number,
-  onProblem: (problem: Problem) => void,
-): () => void {
+/**
+ * Show the record of one building; returns a function that stops the loading.
+ *
+ * @param elevationUnitM Metres per unit of the elevations in it.
+ */
+export function showRecord(place: HTMLElement, run: Run, id: string, elevationUnitM: number): () => void {
   const calledOff = new AbortController();
-  const path = `${jobPath}/buildings/${encodeURIComponent(buildingId)}`;
+  const { signal } = calledOff;
   const load = (): void => {
     place.replaceChildren(el("p", { class: "loading" }, "Loading…"));
-    getJson<Feature>(ofRun(path, method), { signal: calledOff.signal, headers: { Accept: "application/geo+json" } }).then(
+    getJson<Feature>(buildingOf(run, id), { signal, headers: { Accept: "application/geo+json" } }).then(
       ({ properties }) => {
-        if (!calledOff.signal.aborted) place.replaceChildren(...record(properties, path, method, buildingId, elevationUnitM));
+        if (signal.aborted) return;
+        place.replaceChildren(...record(properties, id, elevationUnitM), ...takeAway(properties, run, id));
       },
       (error: unknown) => {
-        if (calledOff.signal.aborted) return;
-        const problem = asProblem(error);
-        place.replaceChildren(problemNotice(problem, load));
-        onProblem(problem);
+        if (!signal.aborted) report(place, error, load);
       },
     );
   };
   load();
-  followDossier(jobPath, method, buildingId, calledOff.signal);
+  followDossier(run, id, signal);
   return () => calledOff.abort();
 }
 
-function record(
-  properties: Record_,
-  path: string,
-  method: string | null,
-  buildingId: string,
-  elevationUnitM: number,
-): HTMLElement[] {
-  const { status, reason, reason_detail: detail, lod, valid } = properties;
-  const category = categoryOf(status, properties["roof_type"]);
-  const modelled = status === "ok" || status === "doubtful" || status === "fallback";
-  const heading = el(
-    "div",
-    { class: "record-head" },
-    el("h2", {}, swatch(category), category === "unknown" ? "Other roof" : CATEGORIES[category].label + roofWord(category)),
-    el("code", { class: "record-id", title: buildingId }, buildingId),
-  );
-  const marks = el(
-    "ul",
-    { class: "marks" },
-    typeof lod === "string" ? el("li", { class: "mark-plain" }, `LoD${lod}`) : null,
-    modelled ? el("li", { class: valid === true ? "mark-good" : "mark-bad" }, valid === true ? "valid solid" : "not valid") : null,
-    properties["is_curved"] === true ? el("li", { class: "mark-plain" }, "curved roof") : null,
-    properties["touches_data_edge"] === true ? el("li", { class: "mark-warn" }, "at the edge of the data") : null,
-  );
-  const why =
-    typeof reason === "string" && reason !== ""
-      ? warningNotice(`${capital(reasonWords(reason))}${typeof detail === "string" && detail !== "" ? `: ${detail}` : "."}`)
-      : null;
-  const codes = Array.isArray(properties["validity_codes"]) ? properties["validity_codes"] : [];
-  return [
-    heading,
-    marks,
-    ...(why === null ? [] : [why]),
-    el("div", { class: "record-links" }, dossierLink()),
-    ...(codes.length > 0 ? [el("p", { class: "hint" }, `Codes of the method's own solid: ${codes.join(", ")}`)] : []),
-    ...tables(properties, elevationUnitM),
-    ...planes(properties["planes"]),
-    ...(modelled ? [takeAway(properties["mesh_path"], path, method, buildingId)] : []),
-  ];
+const isModelled = ({ status }: Properties): boolean => status === "ok" || status === "doubtful" || status === "fallback";
+
+function heading(category: Category, words: string, id: string): HTMLElement {
+  return el("div", { class: "record-head" }, el("h2", {}, swatch(category), words), el("code", { class: "record-id", title: id }, id));
 }
 
-/** Slope and aspect of each roof plane. */
-function planes(value: unknown): HTMLElement[] {
-  if (!Array.isArray(value) || value.length === 0) return [];
-  const rows = (value as Record_[]).map((plane) =>
-    el(
-      "tr",
-      {},
-      el("td", {}, measure(plane["slope_deg"], 1, "°")),
-      el("td", {}, measure(plane["aspect_deg"], 0, "°")),
-      el("td", {}, measure(plane["area_m2"], 1, "m²")),
-      el("td", {}, measure(plane["rmse_m"], 3, "m")),
-    ),
-  );
-  const heads = ["Slope", "Aspect", "Area", "RMSE"].map((name) => el("th", { scope: "col" }, name));
-  return [
-    el(
-      "section",
-      {},
-      el("h3", {}, "Roof planes"),
-      el("table", {}, el("thead", {}, el("tr", {}, ...heads)), el("tbody", {}, ...rows)),
-    ),
+function record(properties: Properties, id: string, elevationUnitM: number): HTMLElement[] {
+  const { status, reason, reason_detail: detail, lod, valid } = properties;
+  const category = categoryOf(status, properties["roof_type"]);
+  const modelled = isModelled(properties);
+  const roof = ["doubtful", "fallback", "failed"].includes(category) ? "" : " roof";
+  const marks: [string, string, boolean][] = [
+    ["mark-plain", `LoD${String(lod)}`, typeof lod === "string"],
+    ["mark-good", "valid solid", modelled && valid === true],
+    ["mark-bad", "not valid", modelled && valid !== true],
+    ["mark-plain", "curved roof", properties["is_curved"] === true],
+    ["mark-warn", "at the edge of the data", properties["touches_data_edge"] === true],
   ];
+  const hasReason = typeof reason === "string" && reason !== "";
+  const codes = Array.isArray(properties["validity_codes"]) ? properties["validity_codes"] : [];
+  const parts = [
+    heading(category, category === "unknown" ? "Other roof" : CATEGORIES[category].label + roof, id),
+    el("ul", { class: "marks" }, ...marks.filter(([, , isThere]) => isThere).map(([kind, words]) => el("li", { class: kind }, words))),
+    hasReason ? warningNotice(`${capital(reasonWords(reason))}${typeof detail === "string" && detail !== "" ? `: ${detail}` : "."}`) : null,
+    el("div", { class: "record-links" }, dossierLink()),
+    codes.length > 0 ? el("p", { class: "hint" }, `Codes of the method's own solid: ${codes.join(", ")}`) : null,
+    ...sections(properties, elevationUnitM),
+    planes(properties["planes"]),
+  ];
+  return parts.filter((part) => part !== null);
+}
+
+/** The most important columns of the record, by section; the file has all of them. */
+function sections(properties: Properties, elevationUnitM: number): HTMLElement[] {
+  return [...new Set(COLUMN_NAMES.map((name) => COLUMNS[name].section))].map((section) => {
+    const names = COLUMN_NAMES.filter((name) => COLUMNS[name].section === section);
+    const rows = names.map((name) => [COLUMNS[name].label, shown(name, properties[name], elevationUnitM)] as const);
+    return el("section", {}, el("h3", {}, section), facts({}, ...rows));
+  });
+}
+
+const PLANE_FIGURES = [
+  ["Slope", "slope_deg", 1, "°"],
+  ["Aspect", "aspect_deg", 0, "°"],
+  ["Area", "area_m2", 1, "m²"],
+  ["RMSE", "rmse_m", 3, "m"],
+] as const;
+
+/** Slope and aspect of each roof plane. */
+function planes(value: unknown): HTMLElement | null {
+  if (!Array.isArray(value) || value.length === 0) return null;
+  const heads = PLANE_FIGURES.map(([head]) => el("th", { scope: "col" }, head));
+  const rows = (value as Properties[]).map((plane) =>
+    el("tr", {}, ...PLANE_FIGURES.map(([, name, digits, unit]) => el("td", {}, measure(plane[name], digits, unit)))),
+  );
+  return el("section", {}, el("h3", {}, "Roof planes"), el("table", {}, el("thead", {}, el("tr", {}, ...heads)), el("tbody", {}, ...rows)));
 }
 
 /** Downloads of one building; a job has meshes of one kind, or none. */
-function takeAway(meshPath: unknown, path: string, method: string | null, buildingId: string): HTMLElement {
-  const kind = typeof meshPath === "string" ? meshPath.slice(meshPath.lastIndexOf(".") + 1) : null;
-  return el(
-    "div",
-    { class: "record-links" },
-    kind === null ? null : downloadLink(kind.toUpperCase(), ofRun(`${path}?f=${kind}`, method), `${buildingId}.${kind}`),
-    downloadLink("CityJSON", ofRun(`${path}?f=cityjson`, method), `${buildingId}.city.json`),
-  );
+function takeAway(properties: Properties, run: Run, id: string): HTMLElement[] {
+  if (!isModelled(properties)) return [];
+  const path = properties["mesh_path"];
+  const kinds = typeof path === "string" ? [path.slice(path.lastIndexOf(".") + 1)] : [];
+  const links = [...kinds.map((kind) => [kind.toUpperCase(), kind]), ["CityJSON", "cityjson"]];
+  return [el("div", { class: "record-links" }, ...links.map(([label, kind]) => downloadLink(label, buildingOf(run, id, `?f=${kind}`))))];
 }
 
-function roofWord(category: string): string {
-  return ["doubtful", "fallback", "failed"].includes(category) ? "" : " roof";
+const OF_REJECTED: [FigureName, string][] = [
+  ["height", FIGURES.height.label],
+  ["area", FIGURES.area.label],
+  ["points", FIGURES.points.label],
+  ["confidence", "Confidence that it is a building"],
+];
+
+/** What is known about an object that was left out. */
+export function rejectedRecord({ id, reason, reasonDetail, figures }: Listed): HTMLElement[] {
+  const why = reason === null ? "No reason is recorded" : capital(reasonWords(reason));
+  const rows = OF_REJECTED.map(([name, label]) => [label, figureWords(name, figures) ?? "–"] as const);
+  return [
+    heading("rejected", "Not a building", id),
+    warningNotice(reasonDetail === null ? `${why}.` : `${why} (${reasonDetail}).`),
+    el("section", {}, el("h3", {}, "What was measured"), facts({}, ...rows)),
+    el(
+      "section",
+      { class: "hint" },
+      "The outline is the box around the object. If it is a building, give this id with the action accept in an overrides file to a run on the command line.",
+    ),
+  ];
 }

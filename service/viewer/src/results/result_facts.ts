@@ -3,6 +3,7 @@
 import type { RunReport } from "../api/types";
 import { buildingWords } from "../jobs/job_words";
 import { RunObjects } from "../models/run_objects";
+import { dropDown } from "../page/action_menu";
 import { el } from "../page/elements";
 import { warningNotice } from "../page/notices";
 import { capital } from "../words/fields";
@@ -29,12 +30,7 @@ export function resultFacts({ report, counts, candidates }: RunObjects): (string
   ]
     .filter((fact) => fact !== null)
     .join(" · ");
-  const notice = el(
-    "details",
-    { class: "menu menu-warnings" },
-    el("summary", {}, counted(warnings.length, "warning")),
-    el("div", { class: "menu-list" }, warningNotice(...warnings)),
-  );
+  const notice = dropDown(el("summary", {}, counted(warnings.length, "warning")), el("div", {}, warningNotice(...warnings)), "menu-warnings");
   const headline = report.headline ?? "";
   return [headline === "" ? "" : warningNotice(capital(headline)), facts, warnings.length === 0 ? "" : " · ", warnings.length === 0 ? "" : notice];
 }

@@ -3,6 +3,7 @@ import type { Feature, StatusInfo } from "../api/types";
 import { downloadMenu, pageLink } from "../jobs/downloads";
 import { jobMenu } from "../jobs/job_actions";
 import { titleOf } from "../jobs/job_words";
+import { OutlineMap } from "../map/outline_map";
 import type { Batch, Listed } from "../models/batching";
 import { outlineColour, type Colouring } from "../models/colouring";
 import { flatOutlines } from "../models/failed_footprints";
@@ -12,33 +13,29 @@ import { RunObjects } from "../models/run_objects";
 import { isFiltered, queryWith, selected, tallies, USUAL, wantedOf, type Wanted } from "../models/selection";
 import { elevationUnitM } from "../models/units";
 import { addressOf, placeOf, queryOf, type Place } from "../page/address";
-import { el } from "../page/elements";
-import { announce, asProblem, problemNotice, warningNotice } from "../page/notices";
-import type { Hooks } from "../page/view";
+import { button, el, setPressed } from "../page/elements";
+import { announce, asProblem, report, warningNotice } from "../page/notices";
 import { ModelScene } from "../scene/scene";
 import { ViewTools } from "../tools/view_tools";
 import { counted } from "../words/numbers";
-import { CATEGORIES, CATEGORY_NAMES, type Category } from "../words/roof_types";
+import { CATEGORIES, CATEGORY_NAMES } from "../words/roof_types";
 import { BuildingList, tallyWords } from "./building_list";
-import { FilterPanel } from "./filter_panel";
+import { changed, FilterPanel } from "./filter_panel";
 import { Legend } from "./legend";
 import { LevelChoice } from "./level_choice";
-import { MapPane } from "./map_pane";
 import { Panel } from "./panel";
-import { showRecord } from "./record";
-import { rejectedRecord } from "./rejected_record";
+import { rejectedRecord, showRecord } from "./record";
 import { nothingFound, resultFacts } from "./result_facts";
 
 /** Show the results of a job: models, list, records and downloads. Returns a function that ends the view. */
-export function showResults(place: HTMLElement, job: StatusInfo, named: Place, hooks: Hooks): () => void {
-  const view = new ResultsView(place, job, named.method, hooks);
+export function showResults(place: HTMLElement, job: StatusInfo, named: Place): () => void {
+  const view = new ResultsView(place, job, named.method);
   view.start().catch((error: unknown) => view.fail(error));
   return () => view.leave();
 }
 
 class ResultsView {
   private readonly calledOff = new AbortController();
-  private readonly jobPath: string;
   /** Labels of the runs of a comparison; empty for other jobs. */
   private readonly methods: string[];
   /** The one whose models are shown. */
@@ -57,7 +54,7 @@ class ResultsView {
   private readonly filters = new FilterPanel((wanted) => this.change(wanted));
   private readonly legend: Legend;
   private readonly levels = new LevelChoice((lod) => void this.showLevel(lod));
-  private readonly viewTools = new ViewTools();
+  private readonly viewTools: ViewTools;
   private readonly objects: RunObjects;
   private loadingRejected: Promise<void> | null = null;
   private wanted: Wanted = USUAL;
@@ -65,11 +62,12 @@ class ResultsView {
   private scene: ModelScene | null = null;
   private colouring: Colouring = "type";
   private readonly stage: HTMLElement;
-  private readonly map: MapPane;
-  private readonly top = el("button", { type: "button", title: "From above, north up (t)", onclick: () => this.scene?.top() }, "Top");
+  private readonly map = new OutlineMap((id) => this.open(id));
+  private isLaid = false;
+  private readonly top = button("Top", () => this.scene?.top(), { title: "From above, north up (t)" });
   private readonly modes = {
-    "3d": el("button", { type: "button", onclick: () => this.change({ ...this.wanted, map: false }) }, "3D"),
-    map: el("button", { type: "button", onclick: () => this.change({ ...this.wanted, map: true }) }, "Map"),
+    "3d": button("3D", () => this.change({ ...this.wanted, map: false })),
+    map: button("Map", () => this.change({ ...this.wanted, map: true })),
   };
   private otherLevel = new AbortController();
   private selected: string | null = null;
@@ -80,48 +78,35 @@ class ResultsView {
     place: HTMLElement,
     private readonly job: StatusInfo,
     private readonly named: string | null,
-    private readonly hooks: Hooks,
   ) {
     this.methods = Object.keys(job.summary?.runs ?? {});
     this.method = named ?? this.methods[0] ?? null;
-    this.jobPath = pathOfJob(job.jobID);
-    this.objects = new RunObjects(this.jobPath, this.method);
+    this.objects = new RunObjects(pathOfJob(job.jobID), this.method);
+    this.viewTools = new ViewTools(this.objects);
     this.list = new BuildingList((id) => this.address(id));
     this.legend = new Legend(
       (category, visible) => {
-        const hidden = new Set(this.wanted.hidden);
-        if (visible) hidden.delete(category);
-        else hidden.add(category);
-        this.change({ ...this.wanted, hidden });
+        this.change({ ...this.wanted, hidden: changed(this.wanted.hidden, [category], !visible) });
       },
       (colouring) => {
         this.colouring = colouring;
-        this.scene?.colourBy(colouring);
-        this.map.recolour();
+        this.scene?.models.colourBy(colouring);
+        this.colourMap();
       },
     );
+    const fit = button("Fit", () => (this.wanted.map ? this.map : this.scene)?.fit(), { title: "Show all (f)" });
     const mode = el("div", { class: "tool-group", role: "group", "aria-label": "3D or map" }, ...Object.values(this.modes));
-    const view = el(
-      "div",
-      { class: "tool-group", role: "group", "aria-label": "View" },
-      el("button", { type: "button", title: "Show all (f)", onclick: () => this.map.fit() || this.scene?.fit() }, "Fit"),
-      this.top,
-    );
+    const view = el("div", { class: "tool-group", role: "group", "aria-label": "View" }, fit, this.top);
     this.panel = new Panel(this.filters.element, this.list, (id) => {
       location.hash = this.address(id);
     });
     this.stage = el("div", { class: "stage3d" }, this.canvas, this.viewTools.cards, this.viewTools.bar(this.levels.element, mode, view), this.note);
-    this.map = new MapPane(this.stage, (id) => this.open(id), (shape) => this.colourOf(shape));
+    this.colourMap();
     place.replaceChildren(
       el(
         "div",
         { class: "result" },
-        el(
-          "div",
-          { class: "result-head" },
-          el("div", { class: "result-title" }, el("h1", {}, titleOf(job)), this.facts),
-          this.downloads,
-        ),
+        el("div", { class: "result-head" }, el("div", { class: "result-title" }, el("h1", {}, titleOf(job)), this.facts), this.downloads),
         this.legend.element,
         this.stage,
         this.panel.element,
@@ -134,13 +119,13 @@ class ResultsView {
     const { summary } = this.job;
     const statuses = (this.method === null ? summary : summary?.runs?.[this.method])?.statuses ?? {};
     const [menu] = await Promise.all([
-      downloadMenu(this.jobPath, this.method, statuses, this.calledOff.signal),
+      downloadMenu(this.objects, statuses, this.calledOff.signal),
       this.objects.readReport(this.calledOff.signal),
     ]);
     if (this.calledOff.signal.aborted) return;
     this.wanted = wantedOf(new URLSearchParams(queryOf(location.hash)));
     this.apply();
-    this.downloads.replaceChildren(...this.comparison(), menu, jobMenu(this.job, this.hooks));
+    this.downloads.replaceChildren(...this.comparison(), menu, jobMenu(this.job));
     this.facts.replaceChildren(...resultFacts(this.objects));
     try {
       this.scene = new ModelScene(this.canvas, (id) => this.open(id));
@@ -166,13 +151,11 @@ class ResultsView {
   /** Say what went wrong; `again` tries it once more. */
   fail(error: unknown, again?: () => void): void {
     if (this.calledOff.signal.aborted) return;
-    const problem = asProblem(error);
     const retry = (): void => {
       this.note.replaceChildren();
       again?.();
     };
-    this.note.replaceChildren(problemNotice(problem, again && retry));
-    this.hooks.onProblem(problem);
+    report(this.note, error, again && retry);
   }
 
   leave(): void {
@@ -181,7 +164,7 @@ class ResultsView {
     this.panel.leave();
     this.viewTools.leave();
     this.scene?.dispose();
-    this.map.close();
+    this.map.dispose();
   }
 
   // --- loading
@@ -199,7 +182,7 @@ class ResultsView {
       return;
     }
     this.note.replaceChildren();
-    this.scene?.replace(batches);
+    this.scene?.models.replace(batches);
     this.scene?.select(this.selected, false);
     this.levels.mark(lod);
     announce(`LoD${lod} is shown.`);
@@ -225,7 +208,7 @@ class ResultsView {
       return;
     }
     announce(`${counted(this.objects.listed.length, "building")} loaded.`);
-    const offered = this.viewTools.offerPoints(this.jobPath, this.method, this.objects.frame);
+    const offered = this.viewTools.offerPoints();
     if (this.objects.counts.has("failed")) {
       await offered; // outlines lie on the terrain
       try {
@@ -274,10 +257,9 @@ class ResultsView {
     const figure = FIGURE_NAMES.find((name) => name === wanted.sort) ?? null;
     this.list.set(this.shown, figure, this.objects.listed.length === 0 ? "" : "No object fits these filters.");
     this.filters.set(wanted, { shown: this.shown.length, all, ...counts });
-    this.legend.set(this.objects.counts, this.shown);
-    this.legend.check(wanted.hidden);
+    this.legend.set(this.objects.counts, wanted.hidden, this.shown);
     const only = isFiltered(wanted) ? new Set(this.shown.map(({ id }) => id)) : null;
-    this.scene?.showOnly(only);
+    this.scene?.models.showOnly(only);
     this.map.showOnly(only);
     if (!this.isLoaded) return;
     if (!wanted.hidden.has("rejected")) void this.loadRejected().catch((error: unknown) => this.fail(error, this.retry));
@@ -302,20 +284,29 @@ class ResultsView {
 
   /** Show the map in place of the 3D view, or the 3D view. */
   private async showMap(wanted: boolean): Promise<void> {
-    this.modes["3d"].setAttribute("aria-pressed", String(!wanted));
-    this.modes.map.setAttribute("aria-pressed", String(wanted));
+    setPressed(this.modes["3d"], !wanted);
+    setPressed(this.modes.map, wanted);
     this.top.hidden = wanted;
     this.canvas.hidden = wanted;
     this.levels.element.classList.toggle("levels-away", wanted);
     this.viewTools.setAway(wanted);
-    if (!wanted) return this.map.close();
-    await this.map.open(this.objects, this.calledOff.signal);
+    const { element } = this.map;
+    if (!wanted) element.remove();
+    if (!wanted || element.isConnected) return;
+    this.stage.prepend(element);
+    this.map.select(this.selected, this.selected !== null);
+    if (this.isLaid || document.querySelector('meta[name="map-tiles"]') === null) return;
+    const { layBackground } = await import("../map/background");
+    await layBackground(this.map, this.objects, this.calledOff.signal);
+    this.isLaid = true;
   }
 
-  /** The colour of an object on the map, also of one that is still to come. */
-  private colourOf({ id, category }: { id: string; category: Category }): string {
-    const object = this.objects.find(id);
-    return object === undefined ? CATEGORIES[category].colour : outlineColour(this.colouring, object);
+  /** Colour the map as the models are, also objects that are still to come. */
+  private colourMap(): void {
+    this.map.colourBy(({ id, category }) => {
+      const object = this.objects.find(id);
+      return object === undefined ? CATEGORIES[category].colour : outlineColour(this.colouring, object);
+    });
   }
 
   // --- the methods of a comparison
@@ -323,19 +314,16 @@ class ResultsView {
   /** The choice of the method whose models are shown, and the link to the page with all methods. */
   private comparison(): HTMLElement[] {
     if (this.methods.length === 0) return [];
-    const choice = el(
-      "select",
-      { "aria-label": "Models of the method" },
-      ...this.methods.map((label) => el("option", { value: label, selected: label === this.method }, label)),
-    );
-    choice.addEventListener("change", () => {
-      // the same building by another method
-      location.hash = addressOf({ job: this.job.jobID, method: choice.value, building: this.selected }, queryOf(location.hash));
-    });
+    // the same building by another method
+    const follow = (): void => {
+      location.hash = addressOf({ job: this.job.jobID, method: select.value, building: this.selected }, queryOf(location.hash));
+    };
+    const options = this.methods.map((label) => el("option", { value: label, selected: label === this.method }, label));
+    const select = el("select", { "aria-label": "Models of the method", onchange: follow }, ...options);
     const hasPage = this.job.links?.some(({ type }) => type === "text/html") === true;
-    const page = pageLink(this.jobPath, "The methods side by side");
+    const page = pageLink(this.objects.jobPath, "The methods side by side");
     page.classList.add("button", "quiet");
-    return hasPage ? [choice, page] : [choice];
+    return hasPage ? [select, page] : [select];
   }
 
   // --- the record of one building
@@ -410,7 +398,7 @@ class ResultsView {
     if (id === null) return this.panel.showList(before);
     this.panel.showRecord(id, !fly, before === null, (body) => {
       const object = this.objects.rejected.get(id);
-      if (object === undefined) return showRecord(body, this.jobPath, this.method, id, elevationUnitM(this.objects.report.crs), this.hooks.onProblem);
+      if (object === undefined) return showRecord(body, this.objects, id, elevationUnitM(this.objects.report.crs));
       body.replaceChildren(...rejectedRecord(object));
       return () => undefined;
     });

@@ -1,6 +1,6 @@
 /** Where the view is seen from: it flies to what it shows, and may follow another view. */
 
-import { PerspectiveCamera, Raycaster, Vector2, Vector3, type Box3, type Ray } from "three";
+import { MathUtils, PerspectiveCamera, Raycaster, Vector2, Vector3, type Box3, type Ray } from "three";
 import { framing } from "./framing";
 import { EYE_M, Navigation, type Surfaces } from "./navigation";
 
@@ -47,7 +47,7 @@ export class Camera {
   }
 
   /** Call a function whenever the camera has moved, but not after `look`; `atOnce` also now. */
-  watch(onMove: OnMove, atOnce: boolean): void {
+  watch(onMove: OnMove, atOnce = false): void {
     this.onMove = onMove;
     this.known = this.words();
     if (atOnce) onMove(this.view.position, this.navigation.target);
@@ -158,9 +158,8 @@ export class Camera {
   private fly(now: number): void {
     if (this.flight === null) return;
     const { from, start, end } = this.flight;
-    const share = Math.min(Math.max((now - from) / FLIGHT_MS, 0), 1);
-    const eased = share * share * (3 - 2 * share);
-    if (share === 1) this.flight = null;
+    const eased = MathUtils.smoothstep(now, from, from + FLIGHT_MS);
+    if (eased === 1) this.flight = null;
     this.navigation.place(new Vector3().lerpVectors(start[1], end[1], eased), new Vector3().lerpVectors(start[0], end[0], eased));
   }
 }

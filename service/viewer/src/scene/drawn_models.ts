@@ -9,18 +9,17 @@ import {
   LineSegments,
   Mesh,
   MeshLambertMaterial,
-  Vector3,
   type Ray,
 } from "three";
 import { LineMaterial } from "three/addons/lines/LineMaterial.js";
 import { LineSegments2 } from "three/addons/lines/LineSegments2.js";
 import { LineSegmentsGeometry } from "three/addons/lines/LineSegmentsGeometry.js";
 import type { Batch } from "../models/batching";
-import { coloursOf, type Colouring } from "../models/colouring";
-import { tintRoofs } from "../models/tinting";
+import { coloursOf, type RoofColours } from "../models/colouring";
 import { isFlat, isHatched } from "../words/roof_types";
-import { hatched } from "./hatching";
-import { pick, type Hit } from "./picking";
+import { boxOf, pick, type Hit } from "./picking";
+
+const STRIPES_M = 1.6;
 
 interface Drawn {
   batch: Batch;
@@ -42,7 +41,10 @@ export class DrawnModels {
   private only: ReadonlySet<string> | null = null;
   private mark: { mesh: Mesh; outline: LineSegments2 } | null = null;
   private marked: string | null = null;
-  private colouring: Colouring = "type";
+  private colouring: RoofColours = "type";
+
+  /** @param onChange Called when something else is to be drawn. */
+  constructor(private readonly onChange: () => void) {}
 
   /** Number of objects. */
   get count(): number {
@@ -73,6 +75,7 @@ export class DrawnModels {
         this.bounds.union(boxOf(batch, index));
       });
     }
+    this.onChange();
   }
 
   /** Put these in place of the models; outlines without a model stay. */
@@ -82,6 +85,11 @@ export class DrawnModels {
     this.places.clear();
     this.bounds.makeEmpty();
     this.add([...staying, ...batches]);
+  }
+
+  /** Height of the lowest and of the highest place. */
+  heights(): [number, number] {
+    return this.bounds.isEmpty() ? [0, 1] : [this.bounds.min.z, this.bounds.max.z];
   }
 
   /** The middle of each model at the height of its floor: x, y, z one after another. */
@@ -95,7 +103,7 @@ export class DrawnModels {
   /** The boxes of the shown models; of all models if none is shown. */
   boxes(): Box3[] {
     const shown = this.all((batch, index) => (batch.shown?.[index] === 0 ? null : boxOf(batch, index))).filter((box) => box !== null);
-    return shown.length > 0 ? shown : this.all(boxOf);
+    return shown.length > 0 ? shown : this.all((batch, index) => boxOf(batch, index));
   }
 
   /** The batches of the shown models. */
@@ -105,25 +113,24 @@ export class DrawnModels {
 
   /** The first of the shown models that a ray meets, at its outer side only if `fromOutside`. */
   first(ray: Ray, fromOutside = false): Hit<Batch> | null {
-    return pick(this.shown(), ray.origin.toArray(), ray.direction.toArray(), fromOutside);
+    return pick(this.shown(), ray, fromOutside);
   }
 
   /** Show these objects and hide all others; null shows all. */
   showOnly(ids: ReadonlySet<string> | null): void {
     this.only = ids;
     for (const drawn of this.drawn) this.showIn(drawn);
+    this.onChange();
   }
 
   /** Choose what the colours of the roofs show. */
-  colourBy(colouring: Colouring): void {
+  colourBy(colouring: RoofColours): void {
     this.colouring = colouring;
-    this.recolour((batch, colours) => colours.set(coloursOf(batch, colouring)));
+    for (const { batch, mesh } of this.drawn) {
+      coloursIn(mesh).set(coloursOf(batch, colouring));
+      mesh.geometry.getAttribute("color").needsUpdate = true;
+    }
     this.select(this.marked);
-  }
-
-  /** Colour the roofs of single buildings; null keeps the colour of the roof type. */
-  tint(colourOf: (id: string) => string | null): void {
-    this.recolour((batch, colours) => tintRoofs(batch, colours, colourOf));
   }
 
   /** Mark a building, or none; returns the box around it. */
@@ -131,6 +138,7 @@ export class DrawnModels {
     this.marked = id;
     if (this.mark !== null) this.remove(this.mark.mesh, this.mark.outline);
     this.mark = null;
+    this.onChange();
     const place = id === null ? undefined : this.places.get(id);
     if (place === undefined) return null;
     const { index, drawn } = place;
@@ -179,13 +187,6 @@ export class DrawnModels {
     drawOnly(edges.geometry, batch.edgeStarts, shown);
   }
 
-  private recolour(change: (batch: Batch, colours: Uint8Array) => void): void {
-    for (const { batch, mesh } of this.drawn) {
-      change(batch, coloursIn(mesh));
-      mesh.geometry.getAttribute("color").needsUpdate = true;
-    }
-  }
-
   private remove(...objects: (Mesh | LineSegments | LineSegments2)[]): void {
     this.object.remove(...objects);
     for (const { geometry } of objects) geometry.dispose();
@@ -210,7 +211,22 @@ function drawOnly(geometry: BufferGeometry, starts: Uint32Array, shown: Uint8Arr
   geometry.setDrawRange(0, n);
 }
 
-function boxOf(batch: Batch, index: number): Box3 {
-  const [x0, y0, z0, x1, y1, z1] = batch.boxes.subarray(6 * index, 6 * index + 6);
-  return new Box3(new Vector3(x0, y0, z0), new Vector3(x1, y1, z1));
+/** Draws dark slanted stripes over a material, as a sign in addition to the colour. */
+function hatched(material: MeshLambertMaterial): MeshLambertMaterial {
+  material.onBeforeCompile = (shader) => {
+    shader.vertexShader = shader.vertexShader
+      .replace("#include <common>", "#include <common>\nvarying vec3 vHatched;")
+      .replace("#include <begin_vertex>", "#include <begin_vertex>\nvHatched = position;");
+    shader.fragmentShader = shader.fragmentShader
+      .replace("#include <common>", "#include <common>\nvarying vec3 vHatched;")
+      .replace(
+        "#include <color_fragment>",
+        `#include <color_fragment>
+        float along = (vHatched.x + vHatched.y + vHatched.z) / ${STRIPES_M.toFixed(2)};
+        float blur = clamp(fwidth(along), 0.0, 0.5);
+        float stripe = smoothstep(0.5 - blur, 0.5 + blur, abs(fract(along) * 2.0 - 1.0));
+        diffuseColor.rgb *= mix(0.55, 1.0, stripe);`,
+      );
+  };
+  return material;
 }

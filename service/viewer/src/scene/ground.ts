@@ -1,3 +1,5 @@
+import { Box3, Ray, Vector3 } from "three";
+
 /** A height field on a square lattice. */
 export interface Ground {
   xMin: number;
@@ -58,7 +60,7 @@ export interface TerrainFile {
  *
  * @param origin Of the scene, in metres.
  */
-export function groundOf({ origin_m, spacing_m, elevation_unit_m, elevations }: TerrainFile, origin: Place): Ground | null {
+export function groundOf({ origin_m, spacing_m, elevation_unit_m, elevations }: TerrainFile, origin: readonly [number, number, number]): Ground | null {
   const [nx, ny] = [elevations[0]?.length ?? 0, elevations.length];
   const finest = level(nx, ny);
   for (const [row, nodes] of elevations.entries()) {
@@ -129,67 +131,53 @@ export function heightAt(ground: Ground, x: number, y: number): number {
   return bilinear(heights, nx, ny, (x - xMin) / cellM, (y - yMin) / cellM);
 }
 
-type Place = readonly [number, number, number];
+/** The box around the ground; level ground has no depth of its own, so a cell is added. */
+function boxOf({ xMin, yMin, cellM, nx, ny, heights }: Ground): Box3 {
+  const [low, high] = heights.reduce(([least, most], z) => [Math.min(least, z), Math.max(most, z)], [Infinity, -Infinity]);
+  return new Box3(new Vector3(xMin, yMin, low - cellM), new Vector3(xMin + cellM * (nx - 1), yMin + cellM * (ny - 1), high + cellM));
+}
+
+/** The boxes of the grounds that rays have met. */
+const boxes = new WeakMap<Ground, Box3>();
 
 /**
- * Distance at which a ray (unit direction) first meets the ground, null if it meets none of it within the lattice or
+ * Distance at which a ray (unit direction) first meets the ground, infinity if it meets none of it within the lattice or
  * begins below it.
  */
-export function groundDistance(ground: Ground, origin: Place, direction: Place): number | null {
-  const { xMin, yMin, cellM, nx, ny } = ground;
-  const [low, high] = heightRange(ground);
-  let [enter, leave] = [0, Infinity];
-  const sides = [
-    [xMin, xMin + cellM * (nx - 1)],
-    [yMin, yMin + cellM * (ny - 1)],
-    [low - cellM, high + cellM], // level ground has no depth of its own
-  ];
-  for (const [axis, [near, far]] of sides.entries()) {
-    if (direction[axis] === 0) {
-      if (origin[axis] < near || origin[axis] > far) return null;
-      continue;
-    }
-    const [a, b] = [(near - origin[axis]) / direction[axis], (far - origin[axis]) / direction[axis]];
-    enter = Math.max(enter, Math.min(a, b));
-    leave = Math.min(leave, Math.max(a, b));
-  }
-  if (enter > leave) return null;
+export function groundDistance(ground: Ground, ray: Ray): number {
+  const box = boxes.get(ground) ?? boxOf(ground);
+  boxes.set(ground, box);
+  const entry = box.containsPoint(ray.origin) ? ray.origin : ray.intersectBox(box, new Vector3());
+  if (entry === null) return Infinity;
+  const enter = entry.distanceTo(ray.origin);
+  const beyond = enter + 2 * box.getSize(new Vector3()).length();
+  const back = new Ray(ray.at(beyond, new Vector3()), ray.direction.clone().negate());
+  const leave = beyond - (back.intersectBox(box, new Vector3())?.distanceTo(back.origin) ?? beyond);
+  const place = new Vector3();
   const above = (distance: number): number => {
-    const [x, y, z] = origin.map((value, axis) => value + distance * direction[axis]);
+    const { x, y, z } = ray.at(distance, place);
     return z - heightAt(ground, x, y);
   };
   // within half a cell in plan the ground is almost a plane; a steep ray takes few steps
-  const plan = Math.hypot(direction[0], direction[1]);
-  const step = Math.max((0.5 * cellM) / Math.max(plan, 1e-9), (leave - enter) / MARCH_STEPS);
-  if (above(enter) <= 0) return null;
+  const plan = Math.hypot(ray.direction.x, ray.direction.y);
+  const step = Math.max((0.5 * ground.cellM) / Math.max(plan, 1e-9), (leave - enter) / MARCH_STEPS);
+  if (above(enter) <= 0) return Infinity;
   for (let before = enter; before < leave; before += step) {
     const after = Math.min(before + step, leave);
     if (above(after) <= 0) return crossing(above, before, after);
   }
-  return null;
+  return Infinity;
 }
 
 const MARCH_STEPS = 2000; // bounds the work of rays along very large lattices
 const HALVINGS = 40; // of a step, until floating point has no more digits
 
 /** Where a function falls through zero, between a place where it is positive and one where it is not. */
-function crossing(above: (distance: number) => number, positive: number, other: number): number {
+export function crossing(above: (at: number) => number, positive: number, other: number): number {
   for (let halving = 0; halving < HALVINGS; halving++) {
     const middle = (positive + other) / 2;
     if (above(middle) > 0) positive = middle;
     else other = middle;
   }
   return positive;
-}
-
-const ranges = new WeakMap<Ground, readonly [number, number]>();
-
-/** Lowest and highest node. */
-function heightRange(ground: Ground): readonly [number, number] {
-  const known = ranges.get(ground);
-  if (known !== undefined) return known;
-  let [low, high] = [Infinity, -Infinity];
-  for (const height of ground.heights) [low, high] = [Math.min(low, height), Math.max(high, height)];
-  ranges.set(ground, [low, high]);
-  return [low, high];
 }

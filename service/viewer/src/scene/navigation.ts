@@ -7,6 +7,7 @@
 
 import { MOUSE, Ray, Vector2, Vector3, type Box3, type PerspectiveCamera, type Quaternion } from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
+import { crossing } from "./ground";
 
 /** A surface that a ray meets. */
 export interface Met {
@@ -38,8 +39,8 @@ const NOTCH = 1.1; // nearer by a notch
 const LINE_PX = 16;
 const PAGE_PX = 400;
 const CENTRE = new Vector2(0, 0);
-const LOWEST_RAD = 0.02;
 const MAX_POLAR_RAD = 0.495 * Math.PI;
+const POINTER = ["pointerdown", "pointermove", "pointerup", "pointercancel"] as const;
 
 export class Navigation {
   readonly controls: OrbitControls;
@@ -63,9 +64,7 @@ export class Navigation {
   ) {
     // the first of all listeners: they must know the surface before OrbitControls acts
     canvas.addEventListener("wheel", this.wheeled, { passive: false });
-    for (const kind of ["pointerdown", "pointermove", "pointerup", "pointercancel"] as const) {
-      canvas.addEventListener(kind, this.fingered);
-    }
+    for (const kind of POINTER) canvas.addEventListener(kind, this.fingered);
     this.controls = new OrbitControls(camera, canvas);
     this.controls.maxPolarAngle = MAX_POLAR_RAD;
     this.controls.enableZoom = false;
@@ -132,29 +131,15 @@ export class Navigation {
   /** Turn around the surface in the middle of the view, in degrees: to the left, and up. */
   turn(leftDeg: number, upDeg: number): void {
     this.begin();
-    const ray = this.ray(CENTRE);
-    const met = this.surfaces.meet(ray);
-    if (met !== null) this.turnAbout(ray.at(met.distance, new Vector3()));
-    const { target } = this.controls;
-    const offset = this.camera.position.clone().sub(target);
-    const length = offset.length();
-    const azimuth = Math.atan2(offset.y, offset.x) - (leftDeg * Math.PI) / 180;
-    const steep = Math.asin(offset.z / length) + (upDeg * Math.PI) / 180;
-    const elevation = Math.min(Math.max(steep, LOWEST_RAD), Math.PI / 2 - 0.001);
-    offset.set(Math.cos(elevation) * Math.cos(azimuth), Math.cos(elevation) * Math.sin(azimuth), Math.sin(elevation));
-    const from = this.camera.position.clone();
-    this.camera.position.copy(target).addScaledVector(offset, length);
-    this.holdBack(from);
-    this.lift();
-    this.settle();
+    this.grasp(CENTRE);
+    this.controls.rotateLeft((leftDeg * Math.PI) / 180);
+    this.controls.rotateUp((upDeg * Math.PI) / 180);
   }
 
   dispose(): void {
     this.controls.dispose();
     this.canvas.removeEventListener("wheel", this.wheeled);
-    for (const kind of ["pointerdown", "pointermove", "pointerup", "pointercancel"] as const) {
-      this.canvas.removeEventListener(kind, this.fingered);
-    }
+    for (const kind of POINTER) this.canvas.removeEventListener(kind, this.fingered);
   }
 
   private begin(): void {
@@ -220,13 +205,8 @@ export class Navigation {
   /** The last place on the way that is not too low: a zoom ends there and does not creep along the ground. */
   private lastAbove(from: Vector3, to: Vector3): Vector3 {
     if (this.clearance(to) >= 0) return to;
-    let [free, low] = [0, 1];
-    for (let halving = 0; halving < 20; halving++) {
-      const middle = (free + low) / 2;
-      if (this.clearance(new Vector3().lerpVectors(from, to, middle)) >= 0) free = middle;
-      else low = middle;
-    }
-    return new Vector3().lerpVectors(from, to, free);
+    const place = (share: number): Vector3 => new Vector3().lerpVectors(from, to, share);
+    return place(crossing((share) => this.clearance(place(share)), 0, 1));
   }
 
   /** Turn around a point from now on; the view stays. */
@@ -251,9 +231,9 @@ export class Navigation {
     return new Vector2((2 * (x - frame.left)) / frame.width - 1, 1 - (2 * (y - frame.top)) / frame.height);
   }
 
-  /** Take the surface at a place of the page for the pivot. */
-  private grasp(x: number, y: number): void {
-    for (const at of [this.inView(x, y), CENTRE]) {
+  /** Take the surface at a place of the view for the pivot, or that in its middle. */
+  private grasp(place: Vector2): void {
+    for (const at of [place, CENTRE]) {
       const ray = this.ray(at);
       const met = this.surfaces.meet(ray);
       if (met === null) continue;
@@ -277,8 +257,8 @@ export class Navigation {
     if (event.type === "pointerdown") {
       if (event.pointerType === "touch") this.fingers.set(event.pointerId, place);
       const [one, two] = [...this.fingers.values()];
-      if (two === undefined) this.grasp(place.x, place.y);
-      else this.grasp((one.x + two.x) / 2, (one.y + two.y) / 2);
+      const middle = two === undefined ? place : one.clone().lerp(two, 0.5);
+      this.grasp(this.inView(middle.x, middle.y));
       return;
     }
     if (event.type !== "pointermove") {

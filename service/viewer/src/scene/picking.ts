@@ -1,3 +1,7 @@
+/** Which building a ray hits: boxes first, then the triangles of the buildings whose box is hit. */
+
+import { Box3, Vector3, type Ray } from "three";
+
 /** The part of a batch that a ray can hit. */
 export interface Pickable {
   boxes: Float32Array;
@@ -16,30 +20,33 @@ export interface Hit<T extends Pickable> {
   corner: number;
 }
 
-type Vector = readonly [number, number, number];
+/** The box around a building of a batch. */
+export function boxOf({ boxes }: Pickable, index: number, box = new Box3()): Box3 {
+  box.min.fromArray(boxes, 6 * index);
+  box.max.fromArray(boxes, 6 * index + 3);
+  return box;
+}
 
 /**
  * The first building that a ray hits; null if it hits none.
  *
- * Boxes first, then the triangles of the buildings whose box is hit (Möller and Trumbore 1997).
- *
  * @param fromOutside Faces that are met from their inner side are passed over.
  */
-export function pick<T extends Pickable>(
-  batches: Iterable<T>,
-  origin: Vector,
-  direction: Vector,
-  fromOutside = false,
-): Hit<T> | null {
+export function pick<T extends Pickable>(batches: Iterable<T>, ray: Ray, fromOutside = false): Hit<T> | null {
+  const [box, met] = [new Box3(), new Vector3()];
+  const corners = [new Vector3(), new Vector3(), new Vector3()] as const;
   let best: Hit<T> | null = null;
   for (const batch of batches) {
     for (let index = 0; index + 1 < batch.starts.length; index++) {
-      if (batch.shown?.[index] === 0) continue;
-      const entry = boxEntry(batch.boxes, 6 * index, origin, direction);
+      if (batch.shown?.[index] === 0 || ray.intersectBox(boxOf(batch, index, box), met) === null) continue;
+      const entry = box.containsPoint(ray.origin) ? 0 : met.distanceTo(ray.origin);
       if (entry >= (best?.distance ?? Infinity)) continue;
       for (let corner = batch.starts[index]; corner < batch.starts[index + 1]; corner += 3) {
-        const distance = triangleDistance(batch.positions, 3 * corner, origin, direction, fromOutside);
-        if (distance < (best?.distance ?? Infinity)) best = { batch, index, distance, corner };
+        corners.forEach((place, n) => place.fromArray(batch.positions, 3 * (corner + n)));
+        // corners run counter-clockwise as seen from outside
+        if (ray.intersectTriangle(...corners, fromOutside, met) === null) continue;
+        const distance = met.distanceTo(ray.origin);
+        if (distance > 0 && distance < (best?.distance ?? Infinity)) best = { batch, index, distance, corner };
       }
     }
   }
@@ -47,60 +54,13 @@ export function pick<T extends Pickable>(
 }
 
 /** Distance from a point to the nearest box of shown buildings; 0 within one, infinity without boxes. */
-export function boxDistance(batches: Iterable<Pickable>, point: Vector): number {
+export function boxDistance(batches: Iterable<Pickable>, point: Vector3): number {
+  const box = new Box3();
   let nearest = Infinity;
-  for (const { boxes, shown } of batches) {
-    for (let at = 0; at < boxes.length; at += 6) {
-      if (shown?.[at / 6] === 0) continue;
-      let squared = 0;
-      for (let axis = 0; axis < 3; axis++) {
-        const beyond = Math.max(boxes[at + axis] - point[axis], point[axis] - boxes[at + axis + 3], 0);
-        squared += beyond * beyond;
-      }
-      nearest = Math.min(nearest, squared);
+  for (const batch of batches) {
+    for (let index = 0; 6 * index < batch.boxes.length; index++) {
+      if (batch.shown?.[index] !== 0) nearest = Math.min(nearest, boxOf(batch, index, box).distanceToPoint(point));
     }
   }
-  return Math.sqrt(nearest);
-}
-
-/** Distance at which the ray enters the box, 0 from inside it, infinity if it misses. */
-function boxEntry(boxes: Float32Array, at: number, origin: Vector, direction: Vector): number {
-  let enter = 0;
-  let leave = Infinity;
-  for (let axis = 0; axis < 3; axis++) {
-    const low = boxes[at + axis] - origin[axis];
-    const high = boxes[at + axis + 3] - origin[axis];
-    if (direction[axis] === 0) {
-      if (low > 0 || high < 0) return Infinity;
-      continue;
-    }
-    const [a, b] = [low / direction[axis], high / direction[axis]];
-    enter = Math.max(enter, Math.min(a, b));
-    leave = Math.min(leave, Math.max(a, b));
-  }
-  return enter <= leave ? enter : Infinity;
-}
-
-function triangleDistance(
-  p: Float32Array,
-  at: number,
-  origin: Vector,
-  direction: Vector,
-  fromOutside: boolean,
-): number {
-  const [dx, dy, dz] = direction;
-  const [e1x, e1y, e1z] = [p[at + 3] - p[at], p[at + 4] - p[at + 1], p[at + 5] - p[at + 2]];
-  const [e2x, e2y, e2z] = [p[at + 6] - p[at], p[at + 7] - p[at + 1], p[at + 8] - p[at + 2]];
-  const [px, py, pz] = [dy * e2z - dz * e2y, dz * e2x - dx * e2z, dx * e2y - dy * e2x];
-  const determinant = e1x * px + e1y * py + e1z * pz;
-  // corners run counter-clockwise as seen from outside: the determinant is positive there
-  if (determinant === 0 || (fromOutside && determinant < 0)) return Infinity;
-  const [tx, ty, tz] = [origin[0] - p[at], origin[1] - p[at + 1], origin[2] - p[at + 2]];
-  const u = (tx * px + ty * py + tz * pz) / determinant;
-  if (u < 0 || u > 1) return Infinity;
-  const [qx, qy, qz] = [ty * e1z - tz * e1y, tz * e1x - tx * e1z, tx * e1y - ty * e1x];
-  const v = (dx * qx + dy * qy + dz * qz) / determinant;
-  if (v < 0 || u + v > 1) return Infinity;
-  const distance = (e2x * qx + e2y * qy + e2z * qz) / determinant;
-  return distance > 0 ? distance : Infinity;
+  return nearest;
 }

@@ -1,6 +1,7 @@
 /** Clicks, moves and keys in the view: they select buildings, or a tool takes them. */
 
 import { Vector2, type Vector3 } from "three";
+import { onKeys } from "../page/elements";
 import type { Tool } from "./layer";
 
 const CLICK_PX = 5; // farther is a drag
@@ -26,7 +27,7 @@ export class Pointing {
     private readonly canvas: HTMLCanvasElement,
     private readonly targets: Targets,
     private readonly onPick: (id: string | null) => void,
-    private readonly keys: Readonly<Record<string, () => void>>,
+    keys: Readonly<Record<string, () => void>>,
     request: () => void,
   ) {
     canvas.addEventListener("pointerdown", ({ clientX, clientY }) => this.down.set(clientX, clientY));
@@ -40,7 +41,12 @@ export class Pointing {
       this.pointer = null;
       canvas.classList.remove("pointing");
     });
-    canvas.addEventListener("keydown", (event) => this.typed(event));
+    canvas.addEventListener("keydown", (event) => {
+      if (this.tool?.typed(event) !== true) return;
+      event.preventDefault();
+      event.stopImmediatePropagation();
+    });
+    onKeys(canvas, keys);
   }
 
   /** Let a tool take the clicks, or null for the selection of buildings. */
@@ -70,16 +76,5 @@ export class Pointing {
     if (button !== 0 || this.down.distanceTo(new Vector2(clientX, clientY)) > CLICK_PX) return;
     if (this.tool !== null) this.tool.clicked(this.targets.placeAt(clientX, clientY));
     else this.onPick(this.targets.buildingAt(clientX, clientY));
-  }
-
-  private typed(event: KeyboardEvent): void {
-    if (this.tool?.typed(event) === true) {
-      event.preventDefault();
-      return;
-    }
-    const action = this.keys[event.key];
-    if (action === undefined || event.ctrlKey || event.metaKey || event.altKey) return;
-    event.preventDefault();
-    action();
   }
 }

@@ -2,8 +2,7 @@
 
 import { Color, PCFShadowMap, Scene, Vector2, Vector3, WebGLRenderer, type Ray } from "three";
 import type { Batch } from "../models/batching";
-import type { Colouring } from "../models/colouring";
-import { Camera, TAN_HALF_FOV, type OnMove } from "./camera";
+import { Camera, TAN_HALF_FOV } from "./camera";
 import { DrawnGround } from "./drawn_ground";
 import { DrawnModels } from "./drawn_models";
 import { groundThrough, type Ground } from "./ground";
@@ -25,9 +24,9 @@ export class ModelScene {
   private readonly renderer: WebGLRenderer;
   private readonly scene = new Scene();
   private readonly light = new Light();
-  private readonly models = new DrawnModels();
+  readonly models = new DrawnModels(() => this.settle());
   private readonly ground = new DrawnGround();
-  private readonly camera: Camera;
+  readonly camera: Camera;
   private readonly pointing: Pointing;
   private readonly layers = new Set<Layer>();
   private readonly watch: ResizeObserver;
@@ -36,14 +35,16 @@ export class ModelScene {
 
   /**
    * @param canvas Fills its parent.
-   * @param onPick Gets the building that was clicked, null for a click beside all of them.
+   * @param onPick Gets the building that was clicked, null for a click beside all of them; without it the view is a
+   *   picture, which may be printed.
    * @throws Error if the browser has no WebGL.
    */
   constructor(
     private readonly canvas: HTMLCanvasElement,
-    onPick: (id: string | null) => void,
+    onPick: ((id: string | null) => void) | null,
   ) {
-    this.renderer = new WebGLRenderer({ canvas, antialias: true, powerPreference: "high-performance" });
+    const isPicture = onPick === null; // kept after drawing, so that it can be printed
+    this.renderer = new WebGLRenderer({ canvas, antialias: true, powerPreference: "high-performance", preserveDrawingBuffer: isPicture });
     this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
     this.renderer.shadowMap.enabled = true;
     this.renderer.shadowMap.type = PCFShadowMap;
@@ -63,9 +64,9 @@ export class ModelScene {
       "-": () => navigation.zoom(0.8),
       f: () => this.fit(),
       t: () => this.top(),
-      Escape: () => onPick(null),
+      ...(onPick === null ? {} : { Escape: () => onPick(null) }),
     };
-    this.pointing = new Pointing(canvas, this, onPick, keys, this.request);
+    this.pointing = new Pointing(canvas, this, onPick ?? (() => undefined), keys, this.request);
     this.watch = new ResizeObserver(() => this.resize());
     this.watch.observe(canvas.parentElement ?? canvas);
     this.resize();
@@ -75,13 +76,6 @@ export class ModelScene {
   add(batches: readonly Batch[]): void {
     this.models.add(batches);
     if (batches.length > 0 && !this.camera.navigation.touched) this.fit(false);
-    this.settle();
-  }
-
-  /** Replace the models by these, seen from the same place; outlines without a model stay. */
-  replace(batches: readonly Batch[]): void {
-    this.models.replace(batches);
-    this.settle();
   }
 
   /** All buildings are added: draw the ground below them. */
@@ -95,12 +89,8 @@ export class ModelScene {
     this.lay(groundThrough(this.models.floors(), box, 160), true);
   }
 
-  /** Draw the measured terrain in place of a ground that is guessed from the floors. */
-  layTerrain(terrain: Ground): void {
-    this.lay(terrain, false);
-  }
-
-  private lay(ground: Ground, isGuessed: boolean): void {
+  /** Draw this ground from now on. */
+  lay(ground: Ground, isGuessed: boolean): void {
     this.ground.lay(ground, isGuessed);
     this.paint();
     this.settle();
@@ -138,50 +128,10 @@ export class ModelScene {
     this.request();
   }
 
-  /** Show these objects and hide all others; null shows all. */
-  showOnly(ids: ReadonlySet<string> | null): void {
-    this.models.showOnly(ids);
-    this.settle();
-  }
-
-  /** Choose what the colours of the roofs show. */
-  colourBy(colouring: Colouring): void {
-    this.models.colourBy(colouring);
-    this.request();
-  }
-
-  /** Colour the roofs of single buildings; null keeps the colour of the roof type. */
-  tint(colourOf: (id: string) => string | null): void {
-    this.models.tint(colourOf);
-    this.request();
-  }
-
-  /** Height of the lowest and of the highest place of the models. */
-  heights(): [number, number] {
-    const { bounds } = this.models;
-    return bounds.isEmpty() ? [0, 1] : [bounds.min.z, bounds.max.z];
-  }
-
-  /** Whether a building is drawn. */
-  has(id: string): boolean {
-    return this.models.has(id);
-  }
-
   /** Mark a building, or none; `fly` brings it into view. */
   select(id: string | null, fly: boolean): void {
     const box = this.models.select(id);
     if (fly && box !== null) this.camera.approach(box);
-    this.request();
-  }
-
-  /** Call a function with position and target of the camera whenever it has moved, but not after `look`; `atOnce` also now. */
-  watchCamera(onMove: OnMove, atOnce = false): void {
-    this.camera.watch(onMove, atOnce);
-  }
-
-  /** Look as another scene does; above the own ground in any case. */
-  look(position: Vector3, target: Vector3): void {
-    this.camera.look(position, target);
   }
 
   /** See everything. */
@@ -226,7 +176,7 @@ export class ModelScene {
     const { camera, models } = this;
     camera.update(now);
     this.pointing.update();
-    camera.setPlanes(boxDistance(models.shown(), camera.view.position.toArray()));
+    camera.setPlanes(boxDistance(models.shown(), camera.view.position));
     models.fade(this.canvas.clientHeight / (2 * camera.distance * TAN_HALF_FOV));
     const heightPx = this.renderer.getDrawingBufferSize(new Vector2()).y;
     for (const layer of this.layers) layer.update(camera.view, heightPx);
@@ -234,6 +184,7 @@ export class ModelScene {
     this.renderer.render(this.scene, camera.view);
     const { render } = this.renderer.info;
     Object.assign(this.canvas.dataset, {
+      drawn: true,
       models: models.count,
       triangles: render.triangles,
       calls: render.calls,

@@ -3,11 +3,11 @@
 import { getJson, request } from "../api/requests";
 import type { Delivery } from "../api/types";
 import { hashOf } from "../page/address";
-import { el } from "../page/elements";
-import { announce, asProblem, problemNotice } from "../page/notices";
-import { fact, table } from "../page/tables";
-import type { Hooks, View } from "../page/view";
-import { Watching } from "../page/watching";
+import { button, el } from "../page/elements";
+import { announce, report } from "../page/notices";
+import { backLink, rawText } from "../page/sheet";
+import { chip, facts, table, type Column } from "../page/tables";
+import { WatchedPage } from "../page/watched_page";
 import { count } from "../words/numbers";
 
 const REFRESH_MS = 2000;
@@ -20,19 +20,14 @@ export const DELIVERY_WORDS: Record<string, string> = {
   dropped: "dropped",
 };
 
+export const deliveryChip = ({ state }: Delivery): HTMLElement => chip(state, DELIVERY_WORDS[state]);
+
 /** What to do about a message that did not arrive. */
-export function deliveryRemedy(state: string): string {
-  switch (state) {
-    case "failed":
-      return "Mend the receiver, then send the message again.";
-    case "gone":
-      return "The receiver answered that it wants no more messages. If that was a mistake, choose “Send what it missed” for the webhook.";
-    case "dropped":
-      return "It was no longer needed. You can still send it again.";
-    default:
-      return "";
-  }
-}
+export const DELIVERY_REMEDIES: Record<string, string> = {
+  failed: "Mend the receiver, then send the message again.",
+  gone: "The receiver answered that it wants no more messages. If that was a mistake, choose “Send what it missed” for the webhook.",
+  dropped: "It was no longer needed. You can still send it again.",
+};
 
 /** The body as it reads best; as it was sent if it is not JSON. */
 export function bodyText(body: string): string {
@@ -43,44 +38,22 @@ export function bodyText(body: string): string {
   }
 }
 
-export function showDelivery(place: HTMLElement, id: string, hooks: Hooks): View {
-  const view = new DeliveryView(place, hooks, id);
-  view.follow();
-  return view;
-}
-
-class DeliveryView extends Watching implements View {
-  private shown = "";
+export class DeliveryView extends WatchedPage<Delivery> {
   private readonly path: string;
-  private readonly sheet = el("div", { class: "sheet" }, el("p", { class: "loading" }, "Loading…"), this.note);
   /** Says why it was not sent again. */
   private readonly refusal = el("div");
 
-  constructor(place: HTMLElement, hooks: Hooks, id: string) {
-    super(hooks, REFRESH_MS);
+  constructor(place: HTMLElement, id: string) {
+    super(place, "Message", backLink("#/webhooks", "All messages"), REFRESH_MS);
     this.path = `webhooks/deliveries/${encodeURIComponent(id)}`;
-    document.title = "Message · gablework";
-    place.replaceChildren(this.sheet);
   }
 
-  follow(): void {
-    void this.load();
+  protected get(signal: AbortSignal): Promise<Delivery> {
+    return getJson<Delivery>(this.path, { signal });
   }
 
-  protected async read(signal: AbortSignal): Promise<boolean> {
-    try {
-      const found = await getJson<Delivery>(this.path, { signal });
-      const state = JSON.stringify(found);
-      if (!signal.aborted && state !== this.shown) {
-        if (this.shown !== "") announce(`The message is ${DELIVERY_WORDS[found.state] ?? found.state}.`);
-        this.shown = state;
-        this.draw(found);
-      }
-      return found.state === "waiting";
-    } catch (error) {
-      if (!signal.aborted && this.shown === "") this.sheet.replaceChildren(backLink(), this.note);
-      throw error;
-    }
+  protected mayChange({ state }: Delivery): boolean {
+    return state === "waiting";
   }
 
   private async replay(): Promise<void> {
@@ -88,65 +61,56 @@ class DeliveryView extends Watching implements View {
     try {
       await request(`${this.path}/replay`, { method: "POST" });
     } catch (error) {
-      const problem = asProblem(error);
-      this.refusal.replaceChildren(problemNotice(problem));
-      this.hooks.onProblem(problem);
+      report(this.refusal, error);
       return;
     }
     announce("The message is sent again.");
     await this.load();
   }
 
-  private draw(found: Delivery): void {
-    const again = el("button", { type: "button", class: "primary", hidden: found.state === "waiting" && found.attemptCount === 0 }, "Send again");
-    again.addEventListener("click", () => void this.replay());
-    const hadFocus = this.sheet.contains(document.activeElement) && document.activeElement?.tagName === "BUTTON";
-    const remedy = deliveryRemedy(found.state);
-    this.sheet.replaceChildren(
+  protected parts(found: Delivery, isFirst: boolean): [HTMLElement, ...HTMLElement[]] {
+    const { state, nextAttempt, finished, body } = found;
+    if (!isFirst) announce(`The message is ${DELIVERY_WORDS[state] ?? state}.`);
+    const isUnderWay = state === "waiting" && found.attemptCount === 0;
+    const again = button("Send again", () => void this.replay(), { class: "primary", hidden: isUnderWay });
+    const remedy = DELIVERY_REMEDIES[state];
+    return [
       el("div", { class: "sheet-head" }, el("h1", {}, `Message: ${found.title}`), again),
-      backLink(),
-      this.note,
       this.refusal,
-      el(
-        "dl",
+      facts(
         { class: "facts-list" },
-        ...fact("State", el("span", { class: `chip chip-${found.state}` }, DELIVERY_WORDS[found.state] ?? found.state), found.reason === undefined ? "" : ` ${found.reason}`),
-        ...(remedy === "" ? [] : fact("What to do", remedy)),
-        ...fact("Receiver", found.url),
-        ...fact("Job", el("a", { href: hashOf(["jobs", found.jobID]) }, found.jobID)),
-        ...fact("Event", found.type),
-        ...fact("Happened", time(found.created)),
-        ...(found.nextAttempt === undefined ? [] : fact("Next attempt", time(found.nextAttempt))),
-        ...(found.finished === undefined ? [] : fact("Over since", time(found.finished))),
-        ...fact("Id", el("code", {}, found.deliveryID)),
+        ["State", deliveryChip(found), found.reason === undefined ? "" : ` ${found.reason}`],
+        remedy === undefined ? null : ["What to do", remedy],
+        ["Receiver", found.url],
+        ["Job", el("a", { href: hashOf(["jobs", found.jobID]) }, found.jobID)],
+        ["Event", found.type],
+        ["Happened", time(found.created)],
+        nextAttempt === undefined ? null : ["Next attempt", time(nextAttempt)],
+        finished === undefined ? null : ["Over since", time(finished)],
+        ["Id", el("code", {}, found.deliveryID)],
       ),
       attempts(found),
-      ...(found.body === undefined
-        ? []
-        : [el("section", {}, el("h2", { id: "body-title" }, "Body"), el("pre", { class: "raw", tabindex: 0, role: "region", "aria-labelledby": "body-title" }, bodyText(found.body)))]),
-    );
-    if (hadFocus) again.focus();
+      ...(body === undefined ? [] : [rawText("body-title", "Body", bodyText(body))]),
+    ];
   }
 }
 
-function attempts({ attempts: made }: Delivery): HTMLElement {
-  const title = el("h2", {}, "Attempts");
-  if (made === undefined || made.length === 0) return el("section", {}, title, el("p", { class: "hint" }, "None yet. A driver of the service sends it."));
-  const rows = made.map(({ number, at, durationMilliseconds, status, error }) =>
-    el(
-      "tr",
-      {},
-      el("td", {}, number),
-      el("td", {}, time(at)),
-      el("td", { class: "figure" }, durationMilliseconds === undefined ? "under way" : `${count(durationMilliseconds)}\u202fms`),
-      el("td", {}, error ?? (status === undefined ? "–" : `answered ${status}`)),
-    ),
-  );
-  return el("section", {}, title, table("Attempts", ["Nr.", "When", "Took", "Result"], rows));
-}
+type Attempt = NonNullable<Delivery["attempts"]>[number];
 
-function backLink(): HTMLElement {
-  return el("p", {}, el("a", { href: "#/webhooks" }, "← All messages"));
+const ATTEMPTS: Column<Attempt>[] = [
+  { head: "Nr.", cell: ({ number }) => number },
+  { head: "When", cell: ({ at }) => time(at) },
+  {
+    head: "Took",
+    kind: "figure",
+    cell: ({ durationMilliseconds: ms }) => (ms === undefined ? "under way" : `${count(ms)}\u202fms`),
+  },
+  { head: "Result", cell: ({ error, status }) => error ?? (status === undefined ? "–" : `answered ${status}`) },
+];
+
+function attempts({ attempts: made = [] }: Delivery): HTMLElement {
+  const none = el("p", { class: "hint" }, "None yet. A driver of the service sends it.");
+  return el("section", {}, el("h2", {}, "Attempts"), made.length === 0 ? none : table("Attempts", ATTEMPTS, made));
 }
 
 const time = (text: string): string => new Date(text).toLocaleString();

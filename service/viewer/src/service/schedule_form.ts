@@ -1,17 +1,16 @@
 /** The form of a schedule: its times, and the request of its jobs. */
 
-import { getJson, pathOfJob, sendJson } from "../api/requests";
+import { getJson, pathOfJob, Problem, sendJson } from "../api/requests";
 import type { Schedule, StatusInfo } from "../api/types";
-import { PROCESS_WORDS, titleOf } from "../jobs/job_words";
+import { processWords, titleOf, whenWords } from "../jobs/job_words";
 import { hashOf, type Address } from "../page/address";
+import { sentForm } from "../page/dialogs";
 import { el } from "../page/elements";
 import { choice, field } from "../page/form_fields";
-import { announce, asProblem, problemNotice } from "../page/notices";
-import type { Hooks, View } from "../page/view";
-import { ago } from "../words/numbers";
+import { announce, report } from "../page/notices";
+import { backLink, sheet } from "../page/sheet";
+import type { View } from "../page/view";
 import { tileLines, USUAL, withTiles } from "./schedules";
-import "../page/dialogs.css";
-import "../page/pages.css";
 
 const OFFERED = 50;
 
@@ -70,9 +69,9 @@ export class TimeFields {
 }
 
 /** A new schedule, from the request of a job. */
-export function showNewSchedule(place: HTMLElement, { query }: Address, hooks: Hooks): View {
+export function showNewSchedule(place: HTMLElement, { query }: Address): View {
   const calledOff = new AbortController();
-  document.title = "New schedule · gablework";
+  const { signal } = calledOff;
   const note = el("div");
   const jobs = el("select", { id: "schedule-job" });
   const tiles = el("textarea", { id: "schedule-tiles", rows: 3, spellcheck: "false" });
@@ -82,19 +81,15 @@ export function showNewSchedule(place: HTMLElement, { query }: Address, hooks: H
     "One per line: uploads of this service, or URLs and paths that it may read. They are read anew each time; uploads never change.",
   );
   const times = new TimeFields({});
-  const go = el("button", { type: "submit", class: "primary" }, "Make the schedule");
   let chosen: StatusInfo | null = null;
   const fail = (error: unknown): void => {
-    if (calledOff.signal.aborted) return;
-    const problem = asProblem(error);
-    note.replaceChildren(problemNotice(problem));
-    hooks.onProblem(problem);
+    if (!signal.aborted) report(note, error);
   };
   const choose = async (id: string): Promise<void> => {
     chosen = null;
     note.replaceChildren();
     if (id === "") return;
-    chosen = await getJson<StatusInfo>(pathOfJob(id), { signal: calledOff.signal });
+    chosen = await getJson<StatusInfo>(pathOfJob(id), { signal });
     const inputs = chosen.request?.inputs ?? {};
     files.hidden = !("tiles" in inputs); // some processes have none
     tiles.value = tileLines(inputs);
@@ -102,52 +97,37 @@ export function showNewSchedule(place: HTMLElement, { query }: Address, hooks: H
   };
   const offer = async (): Promise<void> => {
     const asked = query.get("job") ?? "";
-    const answer = await getJson<{ jobs: StatusInfo[] }>(`jobs?limit=${OFFERED}`, { signal: calledOff.signal });
-    const known = answer.jobs.some(({ jobID }) => jobID === asked);
-    const more = known || asked === "" ? [] : [await getJson<StatusInfo>(pathOfJob(asked), { signal: calledOff.signal })];
-    const now = new Date();
+    const { jobs: newest } = await getJson<{ jobs: StatusInfo[] }>(`jobs?limit=${OFFERED}`, { signal });
+    if (asked !== "" && !newest.some(({ jobID }) => jobID === asked)) newest.unshift(await getJson<StatusInfo>(pathOfJob(asked), { signal }));
+    const words = (job: StatusInfo): string => [titleOf(job), processWords(job), whenWords(job)].join(" · ");
     jobs.replaceChildren(
       el("option", { value: "" }, "choose a job"),
-      ...[...more, ...answer.jobs].map((job) =>
-        el("option", { value: job.jobID, selected: job.jobID === asked }, [titleOf(job), PROCESS_WORDS[job.processID ?? "reconstruct"] ?? "", job.created === undefined ? "" : ago(new Date(job.created), now)].join(" · ")),
-      ),
+      ...newest.map((job) => el("option", { value: job.jobID, selected: job.jobID === asked }, words(job))),
     );
     await choose(asked);
   };
   jobs.addEventListener("change", () => void choose(jobs.value).catch(fail));
-  const form = el(
-    "form",
-    { novalidate: true, class: "narrow" },
-    field("Repeat this job", jobs, "Its method and settings are those of each run. Try them once before you repeat them."),
-    files,
-    ...times.elements,
-    note,
-    el("div", { class: "actions" }, go, el("a", { class: "button quiet", href: "#/schedules" }, "Cancel")),
-  );
-  form.addEventListener("submit", (event) => {
-    event.preventDefault();
-    if (go.getAttribute("aria-disabled") === "true") return;
-    note.replaceChildren();
+  const act = async (): Promise<void> => {
     if (chosen === null) {
-      note.replaceChildren(el("div", { class: "notice notice-error", role: "alert" }, "Choose the job that is repeated."));
       jobs.focus();
-      return;
+      throw new Problem(0, "Choose the job that is repeated.", "", "");
     }
     const { processID = "reconstruct", request: before } = chosen;
     const inputs = before?.inputs ?? {};
     const execute = { ...before, inputs: "tiles" in inputs ? withTiles(inputs, tiles.value) : inputs };
-    go.setAttribute("aria-disabled", "true");
-    sendJson("POST", "schedules", { ...times.value(), processID, execute })
-      .then(async (response) => {
-        const { scheduleID } = (await response.json()) as Schedule;
-        announce("The schedule is made.");
-        location.hash = hashOf(["schedules", scheduleID]);
-      }, fail)
-      .finally(() => go.removeAttribute("aria-disabled"));
-  });
-  place.replaceChildren(
-    el("div", { class: "sheet" }, el("div", { class: "sheet-head" }, el("h1", {}, "New schedule")), el("p", {}, el("a", { href: "#/schedules" }, "← All schedules")), form),
+    const response = await sendJson("POST", "schedules", { ...times.value(), processID, execute });
+    const { scheduleID } = (await response.json()) as Schedule;
+    announce("The schedule is made.");
+    location.hash = hashOf(["schedules", scheduleID]);
+  };
+  const hint = "Its method and settings are those of each run. Try them once before you repeat them.";
+  const form = sentForm(
+    { content: [field("Repeat this job", jobs, hint), files, ...times.elements, note], send: "Make the schedule", act },
+    el("a", { class: "button quiet", href: "#/schedules" }, "Cancel"),
+    () => undefined,
   );
+  form.classList.add("narrow");
+  place.replaceChildren(sheet("New schedule", [], backLink("#/schedules", "All schedules"), form));
   offer().catch(fail);
   return { follow: () => undefined, leave: () => calledOff.abort() };
 }

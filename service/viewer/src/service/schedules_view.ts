@@ -2,257 +2,183 @@
 
 import { getJson, request, sendJson } from "../api/requests";
 import type { Schedule, ScheduleRun, StatusInfo } from "../api/types";
-import { PROCESS_WORDS } from "../jobs/job_words";
+import { processWords } from "../jobs/job_words";
 import { actionMenu, type Item } from "../page/action_menu";
 import { hashOf, type Address } from "../page/address";
 import { ask, openForm } from "../page/dialogs";
-import { el } from "../page/elements";
+import { el, type Child } from "../page/elements";
 import { announce } from "../page/notices";
 import { offsetOf, pager } from "../page/paging";
-import { fact, nothing, table } from "../page/tables";
-import type { Hooks, View } from "../page/view";
-import { Watching } from "../page/watching";
+import { backLink, rawText, section, sheet } from "../page/sheet";
+import { chip, facts, nothing, sub, table, type Column } from "../page/tables";
+import { jobsChanged, type View } from "../page/view";
+import { hasNext, SIZE, WatchedList, type Answer } from "../page/watched_list";
+import { WatchedPage } from "../page/watched_page";
 import { ago } from "../words/numbers";
 import { showNewSchedule, TimeFields } from "./schedule_form";
 import { clockWords, countWords, OUTCOME_WORDS, slotWords, tileLines } from "./schedules";
-import "../page/pages.css";
 
-const SIZE = 25;
 const REFRESH_MS = 10_000;
 
-export function showSchedules(place: HTMLElement, address: Address, hooks: Hooks): View {
+export function showSchedules(place: HTMLElement, address: Address): View {
   const [id] = address.rest;
-  if (id === "new") return showNewSchedule(place, address, hooks);
-  const view = id === undefined ? new ScheduleList(place, hooks) : new ScheduleView(place, hooks, id);
-  view.follow(address);
-  return view;
+  if (id === "new") return showNewSchedule(place, address);
+  return id === undefined ? new ScheduleList(place) : new ScheduleView(place, id);
 }
 
-/** A view of schedules. */
-abstract class Schedules extends Watching implements View {
-  protected offset = 0;
-
-  constructor(hooks: Hooks) {
-    super(hooks, REFRESH_MS);
-  }
-
-  follow({ query }: Address): void {
-    this.offset = offsetOf(query.get("offset"));
-    void this.load();
-  }
-
-  /** What can be done with a schedule. */
-  protected items(one: Schedule): Item[] {
-    const path = pathOf(one.scheduleID);
-    const paused = one.state === "paused";
-    return [
-      { label: "Run now", act: () => this.runNow(one) },
-      { label: paused ? "Resume" : "Pause", act: () => this.change(one, { paused: !paused }, paused ? "It is resumed." : "It is paused.") },
-      { label: "Change the times…", act: () => this.edit(one) },
-      { label: "Its jobs", href: hashOf(["jobs"], { scheduleID: one.scheduleID }) },
-      {
-        label: "Remove…",
-        act: () =>
-          ask({
-            title: "Remove the schedule?",
-            text: `“${nameOf(one)}” runs no more, and the history of its times is deleted. Its jobs stay.`,
-            yes: "Remove it",
-            act: async () => {
-              await request(path, { method: "DELETE" });
-              announce("The schedule is removed.");
-              this.removed();
-            },
-            onProblem: this.hooks.onProblem,
-          }),
-      },
-    ];
-  }
-
-  protected removed(): void {
-    void this.load();
-  }
-
-  private async runNow(one: Schedule): Promise<void> {
-    const response = await request(`${pathOf(one.scheduleID)}/run`, { method: "POST" });
+/** A menu of all that can be done with a schedule. */
+function scheduleMenu(one: Schedule, changed: () => Promise<void>, removed: () => void): HTMLElement {
+  const path = pathOf(one.scheduleID);
+  const runNow = async (): Promise<void> => {
+    const response = await request(`${path}/run`, { method: "POST" });
     const { jobID } = (await response.json()) as StatusInfo;
     announce("The job is submitted.");
-    this.hooks.onChange();
+    jobsChanged();
     location.hash = hashOf(["jobs", jobID]);
-  }
-
-  private async change(one: Schedule, changes: Record<string, unknown>, words: string): Promise<void> {
+  };
+  const change = async (changes: Record<string, unknown>, words: string): Promise<void> => {
     // a change that someone else made meanwhile is not overwritten
-    await sendJson("PATCH", pathOf(one.scheduleID), changes, { "If-Match": `"${one.version}"` });
+    await sendJson("PATCH", path, changes, { "If-Match": `"${one.version}"` });
     announce(words);
-    await this.load();
-  }
-
-  private edit(one: Schedule): void {
+    await changed();
+  };
+  const edit = (): void => {
     const times = new TimeFields(one);
-    openForm({
-      title: "Change the times",
+    openForm("Change the times", {
       content: times.elements,
       send: "Save",
-      act: () => this.change(one, times.value(), "The schedule is changed."),
-      onProblem: this.hooks.onProblem,
+      act: () => change(times.value(), "The schedule is changed."),
     });
-  }
+  };
+  const remove = (): void =>
+    ask("Remove the schedule?", `“${nameOf(one)}” runs no more, and the history of its times is deleted. Its jobs stay.`, {
+      send: "Remove it",
+      act: async () => {
+        await request(path, { method: "DELETE" });
+        announce("The schedule is removed.");
+        removed();
+      },
+    });
+  const paused = one.state === "paused";
+  const items: Item[] = [
+    { label: "Run now", act: runNow },
+    { label: paused ? "Resume" : "Pause", act: () => change({ paused: !paused }, paused ? "It is resumed." : "It is paused.") },
+    { label: "Change the times…", act: edit },
+    { label: "Its jobs", href: hashOf(["jobs"], { scheduleID: one.scheduleID }) },
+    { label: "Remove…", act: remove },
+  ];
+  return actionMenu(nameOf(one), () => items);
 }
 
-class ScheduleList extends Schedules {
-  private readonly frame = el("div");
-  private readonly pages = el("div");
-  private shown = "";
+class ScheduleList extends WatchedList<Schedule> {
+  protected readonly columns: Column<Schedule>[] = [
+    {
+      head: "Schedule",
+      cell: (one) => [
+        el("a", { href: hashOf(["schedules", one.scheduleID]) }, nameOf(one)),
+        sub(`${one.cron} · ${one.timeZone} · ${processWords(one)}`),
+        el("span", { class: "sub only-narrow" }, `next ${nextWords(one)}`),
+      ],
+    },
+    { head: "State", cell: ({ state }) => chip(state) },
+    { head: "Next time", kind: "only-wide", cell: nextWords },
+    { head: "Last time", kind: "only-wide", cell: ({ lastRun }) => (lastRun === undefined ? "–" : [outcomeChip(lastRun), ` ${ago(lastRun.at)}`]) },
+    { head: "Actions", kind: "acts", cell: (one) => scheduleMenu(one, () => this.load(), () => void this.load()) },
+  ];
 
-  constructor(place: HTMLElement, hooks: Hooks) {
-    super(hooks);
-    document.title = "Schedules · gablework";
-    place.replaceChildren(
-      el(
-        "div",
-        { class: "sheet" },
-        el("div", { class: "sheet-head" }, el("h1", {}, "Schedules"), el("a", { class: "button", href: "#/schedules/new" }, "New schedule…")),
-        el("p", { class: "hint" }, "Jobs that the service repeats by itself at fixed times."),
-        this.note,
-        this.frame,
-        this.pages,
-      ),
-    );
+  constructor(place: HTMLElement) {
+    const words = ["schedules"];
+    super({ name: "Schedules", path: "schedules", member: "schedules", words, filters: [], refreshMs: REFRESH_MS });
+    const make = el("a", { class: "button", href: "#/schedules/new" }, "New schedule…");
+    const hint = el("p", { class: "hint" }, "Jobs that the service repeats by itself at fixed times.");
+    place.replaceChildren(sheet("Schedules", [make], hint, this.note, this.frame, this.pages));
   }
 
-  protected async read(signal: AbortSignal): Promise<boolean> {
-    const answer = await getJson<{ schedules: Schedule[]; links: { rel?: string }[] }>(`schedules?limit=${SIZE}&offset=${this.offset}`, { signal });
-    const state = JSON.stringify(answer);
-    if (signal.aborted || state === this.shown || this.frame.querySelector("details[open]") !== null) return true;
-    this.shown = state;
-    const focused = this.frame.contains(document.activeElement) ? document.activeElement?.getAttribute("href") : null;
-    const rows = answer.schedules.map((one) => this.row(one));
-    this.frame.replaceChildren(
-      rows.length === 0
-        ? nothing("No schedules yet. Make one from a job that went well: Actions, Repeat on a schedule.")
-        : table("Schedules", ["Schedule", "State", ["Next time", "only-wide"], ["Last time", "only-wide"], ["Actions", "acts"]], rows),
-    );
-    if (focused != null) this.frame.querySelector<HTMLAnchorElement>(`a[href="${CSS.escape(focused)}"]`)?.focus();
-    const hasNext = answer.links.some(({ rel }) => rel === "next");
-    const page = { offset: this.offset, size: SIZE, shown: rows.length, total: null, hasNext };
-    this.pages.replaceChildren(pager(page, (to) => hashOf(["schedules"], { offset: to === 0 ? "" : String(to) })));
+  protected empty(): string[] {
+    return ["No schedules yet. Make one from a job that went well: Actions, Repeat on a schedule."];
+  }
+
+  protected mayChange(): boolean {
     return true;
   }
-
-  private row(one: Schedule): HTMLElement {
-    const [next] = one.nextTimes;
-    const last = one.lastRun;
-    const nextWords = next === undefined ? "–" : clockWords(next, one.timeZone);
-    return el(
-      "tr",
-      {},
-      el(
-        "th",
-        { scope: "row" },
-        el("a", { href: hashOf(["schedules", one.scheduleID]) }, nameOf(one)),
-        el("span", { class: "sub" }, `${one.cron} · ${one.timeZone} · ${PROCESS_WORDS[one.processID] ?? one.processID}`),
-        el("span", { class: "sub only-narrow" }, `next ${nextWords}`),
-      ),
-      el("td", {}, stateChip(one)),
-      el("td", { class: "only-wide" }, nextWords),
-      el("td", { class: "only-wide" }, last === undefined ? "–" : el("span", {}, outcomeChip(last), ` ${ago(new Date(last.at), new Date())}`)),
-      el("td", { class: "acts" }, actionMenu(nameOf(one), () => this.items(one), this.hooks.onProblem)),
-    );
-  }
 }
 
-class ScheduleView extends Schedules {
-  private shown = "";
-  private readonly content = el("div", {}, el("p", { class: "loading" }, "Loading…"));
+type Runs = Answer & { runs: ScheduleRun[] };
+
+class ScheduleView extends WatchedPage<[Schedule, Runs]> {
+  private offset = 0;
 
   constructor(
     place: HTMLElement,
-    hooks: Hooks,
     private readonly id: string,
   ) {
-    super(hooks);
-    document.title = "Schedule · gablework";
-    place.replaceChildren(el("div", { class: "sheet" }, this.content, this.note));
+    super(place, "Schedule", backLink("#/schedules", "All schedules"), REFRESH_MS);
   }
 
-  protected override removed(): void {
-    location.hash = "#/schedules";
+  override follow(address: Address): void {
+    this.offset = offsetOf(address.query.get("offset"));
+    super.follow(address);
   }
 
-  protected async read(signal: AbortSignal): Promise<boolean> {
+  protected get(signal: AbortSignal): Promise<[Schedule, Runs]> {
     const path = pathOf(this.id);
-    try {
-      const [one, { runs, links }] = await Promise.all([
-        getJson<Schedule>(path, { signal }),
-        getJson<{ runs: ScheduleRun[]; links: { rel?: string }[] }>(`${path}/runs?limit=${SIZE}&offset=${this.offset}`, { signal }),
-      ]);
-      const state = JSON.stringify([one, runs]);
-      if (signal.aborted || state === this.shown || this.content.querySelector("details[open]") !== null) return true;
-      this.shown = state;
-      document.title = `${nameOf(one)} · gablework`;
-      this.content.replaceChildren(...this.parts(one, runs, links.some(({ rel }) => rel === "next")));
-      return true;
-    } catch (error) {
-      if (this.shown === "") this.content.replaceChildren(backLink());
-      throw error;
-    }
+    const runs = getJson<Runs>(`${path}/runs?limit=${SIZE}&offset=${this.offset}`, { signal });
+    return Promise.all([getJson<Schedule>(path, { signal }), runs]);
   }
 
-  private parts(one: Schedule, runs: ScheduleRun[], hasNext: boolean): HTMLElement[] {
+  protected mayChange(): boolean {
+    return true;
+  }
+
+  protected parts([one, answer]: [Schedule, Runs]): [HTMLElement, ...HTMLElement[]] {
+    const zone = one.timeZone;
+    const { runs } = answer;
     const inputs = one.execute?.inputs ?? {};
     const files = tileLines(inputs).split("\n").filter((line) => line !== "");
-    const page = { offset: this.offset, size: SIZE, shown: runs.length, total: null, hasNext };
+    const next = one.nextTimes.map((time) => el("li", {}, clockWords(time, zone)));
+    const page = { offset: this.offset, size: SIZE, shown: runs.length, total: null, hasNext: hasNext(answer) };
+    const leave = (): void => {
+      location.hash = "#/schedules";
+    };
+    document.title = `${nameOf(one)} · gablework`;
     return [
-      el("div", { class: "sheet-head" }, el("h1", {}, nameOf(one)), actionMenu(nameOf(one), () => this.items(one), this.hooks.onProblem)),
-      backLink(),
-      el(
-        "dl",
+      el("div", { class: "sheet-head" }, el("h1", {}, nameOf(one)), scheduleMenu(one, () => this.load(), leave)),
+      facts(
         { class: "facts-list" },
-        ...fact("State", stateChip(one)),
-        ...fact("Times", el("code", {}, one.cron), ` in ${one.timeZone}`),
-        ...fact("Next times", one.state === "paused" ? "none while it is paused" : el("ol", {}, ...one.nextTimes.map((time) => el("li", {}, clockWords(time, one.timeZone))))),
-        ...(one.waiting === undefined ? [] : fact("Waits for its job to end", clockWords(one.waiting, one.timeZone))),
-        ...fact("Up to now", countWords(one.counts) || "nothing yet"),
-        ...fact("Makes", PROCESS_WORDS[one.processID] ?? one.processID),
-        ...(files.length === 0 ? [] : fact("Files", el("ul", {}, ...files.map((file) => el("li", {}, file))))),
+        ["State", chip(one.state)],
+        ["Times", el("code", {}, one.cron), ` in ${zone}`],
+        ["Next times", one.state === "paused" ? "none while it is paused" : el("ol", {}, ...next)],
+        one.waiting === undefined ? null : ["Waits for its job to end", clockWords(one.waiting, zone)],
+        ["Up to now", countWords(one.counts) || "nothing yet"],
+        ["Makes", processWords(one)],
+        files.length === 0 ? null : ["Files", el("ul", {}, ...files.map((file) => el("li", {}, file)))],
       ),
-      el(
-        "section",
-        { "aria-labelledby": "runs-title" },
-        el("h2", { id: "runs-title" }, "What happened"),
+      section(
+        "runs-title",
+        "What happened",
         runs.length === 0
           ? nothing(this.offset > 0 ? "Nothing on this page." : "Nothing yet: no time has come since the schedule was made.")
-          : table("What happened", ["Time", "Outcome", ["Job", "only-wide"]], runs.map((run) => runRow(run, one.timeZone))),
-        pager(page, (to) => hashOf(["schedules", this.id], { offset: to === 0 ? "" : String(to) })),
+          : table("What happened", runColumns(zone), runs),
+        pager(page, ["schedules", this.id]),
       ),
-      el(
-        "section",
-        {},
-        el("h2", { id: "request-title" }, "The request of each job"),
-        el("pre", { class: "raw", tabindex: 0, role: "region", "aria-labelledby": "request-title" }, JSON.stringify(inputs, null, 2)),
-      ),
+      rawText("request-title", "The request of each job", JSON.stringify(inputs, null, 2)),
     ];
   }
 }
 
-function runRow(run: ScheduleRun, zone: string): HTMLElement {
-  const more = slotWords(run);
-  const link = run.jobID === undefined ? null : el("a", { href: hashOf(["jobs", run.jobID]) }, `Job ${run.jobID.slice(0, 8)}`);
-  return el(
-    "tr",
-    {},
-    el("th", { scope: "row", class: "clock" }, clockWords(run.slot ?? run.at, zone), more === "" ? null : el("span", { class: "sub" }, more)),
-    el("td", {}, outcomeChip(run), run.message === "" ? null : el("span", { class: "sub" }, run.message), link === null ? null : el("span", { class: "only-narrow" }, " ", link.cloneNode(true))),
-    el("td", { class: "only-wide" }, link ?? "–"),
-  );
+function runColumns(zone: string): Column<ScheduleRun>[] {
+  const link = ({ jobID }: ScheduleRun): Child => (jobID === undefined ? null : el("a", { href: hashOf(["jobs", jobID]) }, `Job ${jobID.slice(0, 8)}`));
+  return [
+    { head: "Time", kind: "clock", cell: (run) => [clockWords(run.slot ?? run.at, zone), sub(slotWords(run))] },
+    { head: "Outcome", cell: (run) => [outcomeChip(run), sub(run.message), el("span", { class: "only-narrow" }, " ", link(run))] },
+    { head: "Job", kind: "only-wide", cell: (run) => link(run) ?? "–" },
+  ];
 }
 
 const pathOf = (id: string): string => `schedules/${encodeURIComponent(id)}`;
 
 const nameOf = (one: Schedule): string => one.title ?? `Schedule ${one.scheduleID.slice(0, 8)}`;
 
-const backLink = (): HTMLElement => el("p", {}, el("a", { href: "#/schedules" }, "← All schedules"));
+const nextWords = ({ nextTimes: [next], timeZone }: Schedule): string => (next === undefined ? "–" : clockWords(next, timeZone));
 
-const stateChip = ({ state }: Schedule): HTMLElement => el("span", { class: `chip chip-${state}` }, state);
-
-const outcomeChip = ({ outcome }: ScheduleRun): HTMLElement => el("span", { class: `chip chip-${outcome}` }, OUTCOME_WORDS[outcome] ?? outcome);
+const outcomeChip = ({ outcome }: ScheduleRun): HTMLElement => chip(outcome, OUTCOME_WORDS[outcome]);

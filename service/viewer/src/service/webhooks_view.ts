@@ -1,369 +1,264 @@
 /** Webhooks: the receivers of all jobs, the secret of this key, and the log of what was sent. */
 
-import { getJson, request, type Problem } from "../api/requests";
+import { getJson, request, sendJson } from "../api/requests";
 import type { Delivery, EventKind, Secret, Webhook } from "../api/types";
 import { actionMenu, type Item } from "../page/action_menu";
 import { hashOf, type Address } from "../page/address";
 import { ask, openDialog, openForm } from "../page/dialogs";
-import { el } from "../page/elements";
-import { choice, field } from "../page/form_fields";
-import { announce, asProblem, problemNotice } from "../page/notices";
-import { offsetOf, pager } from "../page/paging";
-import { nothing, table } from "../page/tables";
-import type { Hooks, View } from "../page/view";
+import { button, el } from "../page/elements";
+import { Boxes, choice, field, searchForm } from "../page/form_fields";
+import { announce, asProblem, report } from "../page/notices";
+import { section, sheet } from "../page/sheet";
+import { chip, nothing, sub, table, type Column } from "../page/tables";
+import type { View } from "../page/view";
+import { WatchedList } from "../page/watched_list";
 import { Watching } from "../page/watching";
 import { ago } from "../words/numbers";
-import { DELIVERY_WORDS, showDelivery } from "./delivery_view";
-import "../page/pages.css";
+import { deliveryChip, DELIVERY_WORDS, DeliveryView } from "./delivery_view";
 
-const SIZE = 25;
 const REFRESH_MS = 4000;
-const LOG_HEADS = ["Message", ["Receiver", "only-wide"], "State", ["Attempts", "only-wide"], ["When", "only-wide"]] as const;
 
-export function showWebhooks(place: HTMLElement, address: Address, hooks: Hooks): View {
-  const [part, id] = address.rest;
-  if (part === "deliveries" && id !== undefined) return showDelivery(place, id, hooks);
-  const view = new Webhooks(place, hooks);
-  view.follow(address);
-  return view;
+export function showWebhooks(place: HTMLElement, { rest: [part, id] }: Address): View {
+  return part === "deliveries" && id !== undefined ? new DeliveryView(place, id) : new Webhooks(place);
 }
 
-const change = (path: string, method: string, body?: unknown): Promise<Response> =>
-  request(path, {
-    method,
-    ...(body === undefined ? {} : { headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) }),
-  });
+const nameOf = ({ description, url }: Webhook): string => description ?? url;
 
-class Webhooks implements View {
-  private readonly calledOff = new AbortController();
+class Webhooks extends Watching implements View {
   private readonly receivers = el("div");
-  private readonly make = el("button", { type: "button", hidden: true }, "New webhook…");
+  private readonly make = button("New webhook…", () => this.create(), { hidden: true });
   private readonly log: Log;
   private webhooks: Webhook[] = [];
   private kinds: EventKind[] = [];
+  private readonly columns: Column<Webhook>[] = [
+    {
+      head: "Receiver",
+      cell: (one) => [
+        nameOf(one),
+        one.description === undefined ? null : sub(one.url),
+        el("span", { class: "sub only-narrow" }, this.eventsOf(one)),
+      ],
+    },
+    { head: "Events", kind: "only-wide", cell: (one) => this.eventsOf(one) },
+    {
+      head: "State",
+      cell: ({ enabled, disabledReason }) => [chip(enabled ? "good" : "warn", enabled ? "enabled" : "disabled"), sub(disabledReason)],
+    },
+    { head: "Actions", kind: "acts", cell: (one) => actionMenu(nameOf(one), () => this.items(one)) },
+  ];
 
-  constructor(
-    place: HTMLElement,
-    private readonly hooks: Hooks,
-  ) {
-    document.title = "Webhooks · gablework";
-    this.log = new Log(hooks, (id) => this.webhooks.find(({ webhookID }) => webhookID === id)?.description ?? null);
-    this.make.addEventListener("click", () => this.create());
+  constructor(place: HTMLElement) {
+    super(0);
+    this.log = new Log((id) => this.webhooks.find(({ webhookID }) => webhookID === id)?.description ?? null);
     place.replaceChildren(
-      el(
-        "div",
-        { class: "sheet" },
-        el("div", { class: "sheet-head" }, el("h1", {}, "Webhooks")),
+      sheet(
+        "Webhooks",
+        [],
         el("p", { class: "hint" }, "The service sends signed messages about jobs to these URLs, and to those that a job names itself."),
         el(
           "section",
           { "aria-labelledby": "receivers-title" },
           el("div", { class: "sheet-head" }, el("h2", { id: "receivers-title" }, "Receivers of all jobs"), el("span", { class: "spacer" }), this.make),
+          this.note,
           this.receivers,
         ),
         this.log.element,
-        this.ownSecret(),
+        ownSecret(),
       ),
     );
     void this.load();
   }
 
-  follow({ query }: Address): void {
-    this.log.show(query);
+  follow(address: Address): void {
+    this.log.follow(address);
   }
 
-  leave(): void {
-    this.calledOff.abort();
+  override leave(): void {
+    super.leave();
     this.log.leave();
   }
 
   // --- receivers
 
-  private async load(): Promise<void> {
-    const { signal } = this.calledOff;
+  protected async read(signal: AbortSignal): Promise<boolean> {
     try {
       const found = await getJson<{ webhooks: Webhook[]; eventTypes: EventKind[] }>("webhooks?limit=1000", { signal });
+      if (signal.aborted) return false;
       [this.webhooks, this.kinds] = [found.webhooks, found.eventTypes];
-      if (signal.aborted) return;
-      this.make.hidden = false;
-      this.log.offer(this.webhooks);
-      this.draw();
     } catch (error) {
-      if (signal.aborted) return;
-      const problem = asProblem(error);
-      const kept =
-        problem.kind === "forbidden"
-          ? nothing("Only keys with the scope admin see and make receivers of all jobs. The messages of your own jobs are below.")
-          : problemNotice(problem, () => void this.load());
-      this.receivers.replaceChildren(kept);
-      this.hooks.onProblem(problem);
+      if (asProblem(error).kind !== "forbidden") throw error;
+      this.receivers.replaceChildren(nothing("Only keys with the scope admin see and make receivers of all jobs. The messages of your own jobs are below."));
+      return false;
     }
-  }
-
-  private draw(): void {
-    const rows = this.webhooks.map((one) => this.row(one));
+    this.make.hidden = false;
+    this.log.offer(this.webhooks);
     this.receivers.replaceChildren(
-      rows.length === 0
+      this.webhooks.length === 0
         ? nothing("No receivers yet. A new one gets the ends of all jobs from then on.")
-        : table("Receivers", ["Receiver", ["Events", "only-wide"], "State", ["Actions", "acts"]], rows),
+        : table("Receivers", this.columns, this.webhooks),
     );
+    return false;
   }
 
-  private row(one: Webhook): HTMLElement {
-    const path = `webhooks/${encodeURIComponent(one.webhookID)}`;
-    const events = this.kinds
-      .filter(({ type }) => one.events.includes(type))
-      .map(({ title }) => title)
-      .join(", ");
-    const items: Item[] = [
-      { label: "Send what it missed", act: () => this.changed(change(`${path}/replay`, "POST"), "What it missed is sent.") },
-      { label: "Its messages", href: hashOf(["webhooks"], { webhook: one.webhookID }) },
-      { label: "Remove…", act: () => this.remove(one, path) },
+  private eventsOf({ events }: Webhook): string {
+    const chosen = this.kinds.filter(({ type }) => events.includes(type));
+    return chosen.map(({ title }) => title).join(", ");
+  }
+
+  private items({ webhookID, url }: Webhook): Item[] {
+    const path = `webhooks/${encodeURIComponent(webhookID)}`;
+    const remove = (): void =>
+      ask("Remove the webhook?", `${url} gets nothing more. Messages that wait are dropped; the log stays.`, {
+        send: "Remove it",
+        act: () => this.changed(path, "DELETE", "It is removed."),
+      });
+    return [
+      { label: "Send what it missed", act: () => this.changed(`${path}/replay`, "POST", "What it missed is sent.") },
+      { label: "Its messages", href: hashOf(["webhooks"], { webhook: webhookID }) },
+      { label: "Remove…", act: remove },
     ];
-    const name = one.description ?? one.url;
-    return el(
-      "tr",
-      {},
-      el(
-        "th",
-        { scope: "row" },
-        name,
-        one.description === undefined ? null : el("span", { class: "sub" }, one.url),
-        el("span", { class: "sub only-narrow" }, events),
-      ),
-      el("td", { class: "only-wide" }, events),
-      el(
-        "td",
-        {},
-        el("span", { class: `chip ${one.enabled ? "chip-good" : "chip-warn"}` }, one.enabled ? "enabled" : "disabled"),
-        one.disabledReason === undefined ? null : el("span", { class: "sub" }, one.disabledReason),
-      ),
-      el("td", { class: "acts" }, actionMenu(name, () => items, this.hooks.onProblem)),
-    );
   }
 
-  private remove({ url }: Webhook, path: string): void {
-    ask({
-      title: "Remove the webhook?",
-      text: `${url} gets nothing more. Messages that wait are dropped; the log stays.`,
-      yes: "Remove it",
-      act: () => this.changed(change(path, "DELETE"), "It is removed."),
-      onProblem: this.hooks.onProblem,
-    });
-  }
-
-  private async changed(done: Promise<unknown>, words: string): Promise<void> {
-    await done;
+  private async changed(path: string, method: string, words: string): Promise<void> {
+    await request(path, { method });
     announce(words);
     await this.load();
     this.log.refresh();
   }
 
   private create(): void {
-    const url = el("input", { type: "url", id: "webhook-url", autocomplete: "off", placeholder: "https://hooks.example.org/gablework", "aria-describedby": "webhook-url-hint" });
+    const url = el("input", { type: "url", id: "webhook-url", autocomplete: "off", placeholder: "https://hooks.example.org/gablework" });
     const description = el("input", { type: "text", id: "webhook-description", maxlength: 500, autocomplete: "off" });
-    const boxes = this.kinds.map(({ type, title, isDefault }) => {
-      const box = el("input", { type: "checkbox", value: type, checked: isDefault });
-      return { box, label: el("label", {}, box, ` ${title}`) };
-    });
-    openForm({
-      title: "New webhook",
+    const events = new Boxes();
+    const usual = this.kinds.filter(({ isDefault }) => isDefault).map(({ type }) => type);
+    events.offer(Object.fromEntries(this.kinds.map(({ type, title }) => [type, title])), usual);
+    openForm("New webhook", {
       content: [
-        el(
-          "div",
-          { class: "field" },
-          el("label", { for: url.id }, "URL"),
-          url,
-          el("p", { class: "hint", id: "webhook-url-hint" }, "Public addresses by https; others only if the operator of this service has listed them."),
-        ),
-        el("fieldset", { class: "field" }, el("legend", {}, "Events"), el("div", { class: "boxes" }, ...boxes.map(({ label }) => label))),
-        el("div", { class: "field" }, el("label", { for: description.id }, "Description"), description),
+        field("URL", url, "Public addresses by https; others only if the operator of this service has listed them."),
+        el("fieldset", { class: "field" }, el("legend", {}, "Events"), events.element),
+        field("Description", description),
       ],
       send: "Make it",
       act: async () => {
-        const body = {
-          url: url.value.trim(),
-          events: boxes.filter(({ box }) => box.checked).map(({ box }) => box.value),
-          description: description.value.trim() || null,
-        };
-        const made = (await (await change("webhooks", "POST", body)).json()) as Secret;
+        const body = { url: url.value.trim(), events: events.chosen, description: description.value.trim() || null };
+        const made = (await (await sendJson("POST", "webhooks", body)).json()) as Secret;
         await this.load();
         return () => showSecret(made);
       },
-      onProblem: this.hooks.onProblem,
     });
   }
+}
 
-  // --- the secret of the key
-
-  private ownSecret(): HTMLElement {
-    const note = el("div");
-    const fail = (error: unknown): void => {
-      const problem: Problem = asProblem(error);
-      note.replaceChildren(problemNotice(problem));
-      this.hooks.onProblem(problem);
-    };
-    const show = el("button", { type: "button" }, "Show the secret…");
-    show.addEventListener("click", () => {
-      note.replaceChildren();
-      getJson<Secret>("webhooks/secret").then((secret) => showSecret(secret), fail);
+/** The secret of the key. */
+function ownSecret(): HTMLElement {
+  const note = el("div");
+  const show = (): void => {
+    note.replaceChildren();
+    getJson<Secret>("webhooks/secret").then(showSecret, (error: unknown) => report(note, error));
+  };
+  const replace = (): void =>
+    ask("Replace the secret of this key?", "The old secret signs no longer. Give the new one to the receivers at once.", {
+      send: "Replace it",
+      act: async () => {
+        const secret = (await (await request("webhooks/secret/rotate", { method: "POST" })).json()) as Secret;
+        return () => showSecret(secret);
+      },
     });
-    const replace = el("button", { type: "button", class: "quiet" }, "Replace it…");
-    replace.addEventListener("click", () =>
-      ask({
-        title: "Replace the secret of this key?",
-        text: "The old secret signs no longer. Give the new one to the receivers at once.",
-        yes: "Replace it",
-        act: async () => {
-          const secret = (await (await change("webhooks/secret/rotate", "POST")).json()) as Secret;
-          return () => showSecret(secret);
-        },
-        onProblem: this.hooks.onProblem,
-      }),
-    );
-    return el(
-      "section",
-      { "aria-labelledby": "secret-title" },
-      el("h2", { id: "secret-title" }, "Secret for the subscribers of single jobs"),
-      el("p", { class: "hint" }, "Messages to the URLs that a job names itself are signed with one secret per key."),
-      el("div", { class: "actions" }, show, replace),
-      note,
-    );
-  }
+  return section(
+    "secret-title",
+    "Secret for the subscribers of single jobs",
+    el("p", { class: "hint" }, "Messages to the URLs that a job names itself are signed with one secret per key."),
+    el("div", { class: "actions" }, button("Show the secret…", show), button("Replace it…", replace, { class: "quiet" })),
+    note,
+  );
 }
 
 /** Show a secret with a button that copies it. */
 function showSecret({ secret }: Secret): void {
-  const field = el("input", { type: "text", id: "secret", readonly: true, value: secret, spellcheck: "false" });
-  const copy = el("button", { type: "button", class: "primary" }, "Copy");
-  const done = el("button", { type: "button", class: "quiet" }, "Done");
-  copy.addEventListener("click", () => {
-    field.select();
-    // only pages by https and of this machine may write to the clipboard by themselves
-    (navigator.clipboard === undefined ? Promise.reject(new Error("no clipboard")) : navigator.clipboard.writeText(secret)).then(
-      () => (copy.textContent = "Copied"),
-      () => (copy.textContent = "Press Ctrl+C"),
-    );
-  });
+  const text = el("input", { type: "text", id: "secret", readonly: true, value: secret, spellcheck: "false" });
+  const copy = button(
+    "Copy",
+    () => {
+      text.select();
+      // only pages by https and of this machine may write to the clipboard by themselves
+      (navigator.clipboard === undefined ? Promise.reject(new Error("no clipboard")) : navigator.clipboard.writeText(secret)).then(
+        () => (copy.textContent = "Copied"),
+        () => (copy.textContent = "Press Ctrl+C"),
+      );
+    },
+    { class: "primary" },
+  );
   const { close } = openDialog("The secret", [
     el("p", {}, "Give it to the receiver: it checks with it that messages are from this service. The secret of a webhook is shown only now."),
-    el("div", { class: "field" }, el("label", { for: field.id }, "Secret"), field),
-    el("div", { class: "actions" }, done, copy),
+    field("Secret", text),
+    el("div", { class: "actions" }, button("Done", () => close(), { class: "quiet" }), copy),
   ]);
-  done.addEventListener("click", close);
 }
 
 /** The log of deliveries, filtered and page by page. */
-class Log extends Watching {
+class Log extends WatchedList<Delivery> {
   readonly element: HTMLElement;
-  private query = new URLSearchParams();
-  private shown = "";
+  protected readonly columns: Column<Delivery>[] = [
+    {
+      head: "Message",
+      cell: (one) => [
+        el("a", { href: hashOf(["webhooks", "deliveries", one.deliveryID]) }, one.title),
+        sub(`of job ${one.jobID.slice(0, 8)}`, el("span", { class: "only-narrow" }, ` · ${ago(one.created)} · ${one.url}`)),
+      ],
+    },
+    {
+      head: "Receiver",
+      kind: "only-wide url",
+      cell: ({ url, webhookID }) => [url, sub(webhookID === undefined ? "named by the job" : (this.nameOf(webhookID) ?? ""))],
+    },
+    { head: "State", cell: (one) => [deliveryChip(one), sub(one.reason)] },
+    { head: "Attempts", kind: "only-wide figure", cell: ({ attemptCount }) => attemptCount },
+    {
+      head: "When",
+      kind: "only-wide when",
+      cell: ({ created }) => ago(created),
+      title: ({ created }) => new Date(created).toLocaleString(),
+    },
+  ];
   private readonly state = choice("log-state", { "": "any", ...DELIVERY_WORDS });
   private readonly receiver = choice("log-receiver", { "": "any" });
   private readonly job = el("input", { type: "text", id: "log-job", autocomplete: "off", spellcheck: "false" });
-  private readonly frame = el("div");
-  private readonly pages = el("div");
 
-  constructor(
-    hooks: Hooks,
-    private readonly nameOf: (webhook: string) => string | null,
-  ) {
-    super(hooks, REFRESH_MS);
-    const form = el(
-      "form",
-      { class: "search", role: "search", "aria-label": "Messages" },
-      field("Id of the job", this.job),
-      field("State", this.state),
-      field("Receiver", this.receiver),
-    );
+  constructor(private readonly nameOf: (webhook: string) => string | null) {
+    const filters = ["job", "state", "webhook"];
+    super({ name: "Messages", path: "webhooks/deliveries", member: "deliveries", words: ["webhooks"], filters, refreshMs: REFRESH_MS });
     const search = (): void => {
-      const query = { job: this.job.value.trim(), state: this.state.value, webhook: this.receiver.value };
-      location.hash = hashOf(["webhooks"], query);
+      location.hash = hashOf(["webhooks"], { job: this.job.value.trim(), state: this.state.value, webhook: this.receiver.value });
     };
-    form.addEventListener("submit", (event) => {
-      event.preventDefault();
-      search();
-    });
-    for (const control of [this.job, this.state, this.receiver]) control.addEventListener("change", search);
-    this.element = el("section", { "aria-labelledby": "log-title" }, el("h2", { id: "log-title" }, "Messages"), form, this.note, this.frame, this.pages);
+    const form = searchForm("Messages", search, field("Id of the job", this.job), field("State", this.state), field("Receiver", this.receiver));
+    this.element = section("log-title", "Messages", form, this.note, this.frame, this.pages);
   }
 
   /** Offer the receivers as a filter. */
   offer(webhooks: readonly Webhook[]): void {
-    this.receiver.replaceChildren(
-      el("option", { value: "" }, "any"),
-      ...webhooks.map(({ webhookID, description, url }) => el("option", { value: webhookID }, description ?? url)),
-    );
-    this.receiver.value = this.query.get("webhook") ?? "";
-    this.shown = "";
+    const options = Object.entries({ "": "any", ...Object.fromEntries(webhooks.map((one) => [one.webhookID, nameOf(one)])) });
+    this.receiver.replaceChildren(...options.map(([value, label]) => el("option", { value }, label)));
+    this.receiver.value = this.query["webhook"] ?? "";
     this.refresh();
   }
 
-  show(query: URLSearchParams): void {
-    this.query = query;
+  override follow(address: Address): void {
+    const { query } = address;
     this.job.value = query.get("job") ?? "";
     this.state.value = query.get("state") ?? "";
     this.receiver.value = query.get("webhook") ?? "";
-    this.shown = "";
-    void this.load();
+    super.follow(address);
   }
 
-  refresh(): void {
-    void this.load();
+  protected empty(): string[] {
+    return ["No messages yet: no job has named a receiver, or nothing has happened since."];
   }
 
-  protected async read(signal: AbortSignal): Promise<boolean> {
-    const offset = offsetOf(this.query.get("offset"));
-    const asked = new URLSearchParams({ limit: String(SIZE), offset: String(offset) });
-    for (const name of ["job", "state", "webhook"]) {
-      const value = this.query.get(name);
-      if (value !== null && value !== "") asked.set(name, value);
-    }
-    const answer = await getJson<{ deliveries: Delivery[]; links: { rel?: string }[] }>(`webhooks/deliveries?${asked}`, { signal });
-    if (signal.aborted) return false;
-    this.draw(answer.deliveries, offset, answer.links.some(({ rel }) => rel === "next"));
-    return answer.deliveries.some(({ state }) => state === "waiting");
+  protected override filtered(): (Node | string)[] {
+    return ["No message fits. ", el("a", { href: "#/webhooks" }, "Show all messages")];
   }
 
-  private draw(deliveries: Delivery[], offset: number, hasNext: boolean): void {
-    const state = JSON.stringify(deliveries);
-    if (state === this.shown) return;
-    this.shown = state;
-    const focused = this.frame.contains(document.activeElement) ? document.activeElement?.getAttribute("href") : null;
-    const isFiltered = ["job", "state", "webhook"].some((name) => (this.query.get(name) ?? "") !== "");
-    if (deliveries.length === 0) {
-      const words = isFiltered ? "No message fits. " : "No messages yet: no job has named a receiver, or nothing has happened since.";
-      this.frame.replaceChildren(nothing(words, isFiltered ? el("a", { href: "#/webhooks" }, "Show all messages") : null));
-    } else {
-      const now = new Date();
-      this.frame.replaceChildren(table("Messages", LOG_HEADS, deliveries.map((one) => this.row(one, now))));
-    }
-    if (focused != null) this.frame.querySelector<HTMLAnchorElement>(`a[href="${CSS.escape(focused)}"]`)?.focus();
-    const page = { offset, size: SIZE, shown: deliveries.length, total: null, hasNext };
-    this.pages.replaceChildren(pager(page, (to) => hashOf(["webhooks"], { ...Object.fromEntries(this.query), offset: to === 0 ? "" : String(to) })));
-  }
-
-  private row(one: Delivery, now: Date): HTMLElement {
-    const receiver = one.webhookID === undefined ? "named by the job" : (this.nameOf(one.webhookID) ?? "");
-    const when = ago(new Date(one.created), now);
-    return el(
-      "tr",
-      {},
-      el(
-        "th",
-        { scope: "row" },
-        el("a", { href: hashOf(["webhooks", "deliveries", one.deliveryID]) }, one.title),
-        el("span", { class: "sub" }, `of job ${one.jobID.slice(0, 8)}`, el("span", { class: "only-narrow" }, ` · ${when} · ${one.url}`)),
-      ),
-      el("td", { class: "only-wide url" }, one.url, receiver === "" ? null : el("span", { class: "sub" }, receiver)),
-      el(
-        "td",
-        {},
-        el("span", { class: `chip chip-${one.state}` }, DELIVERY_WORDS[one.state] ?? one.state),
-        one.reason === undefined ? null : el("span", { class: "sub" }, one.reason),
-      ),
-      el("td", { class: "only-wide figure" }, one.attemptCount),
-      el("td", { class: "only-wide when", title: new Date(one.created).toLocaleString() }, when),
-    );
+  protected mayChange({ state }: Delivery): boolean {
+    return state === "waiting";
   }
 }

@@ -1,17 +1,18 @@
 import type { Vector3 } from "three";
-import { el } from "../page/elements";
+import { button, el, setPressed } from "../page/elements";
 import { announce } from "../page/notices";
+import { facts } from "../page/tables";
 import type { Tool } from "../scene/layer";
 import type { ModelScene } from "../scene/scene";
+import { measure } from "../words/numbers";
 import { MeasureDrawing } from "./measure_drawing";
-import { inWords, measured } from "./measuring";
 
 const STEP_PX = 16; // of the cross, with an arrow key
 const FINE_PX = 1; // the same with Shift
 
 /** Measures between two places: two clicks or taps, or a cross that the arrow keys move and Enter sets. */
 export class MeasureTool implements Tool {
-  readonly button = el("button", { type: "button", title: "Measure distances and heights (m)", "aria-pressed": "false" }, "Measure");
+  readonly button = button("Measure", () => this.toggle(), { title: "Measure distances and heights (m)", "aria-pressed": "false" });
   readonly card = el("section", { class: "stage-card measure", "aria-label": "Measurement", hidden: true });
   /** The place where the keyboard sets. */
   readonly cross = el("div", { class: "cross", "aria-hidden": "true", hidden: true });
@@ -23,11 +24,9 @@ export class MeasureTool implements Tool {
   constructor(
     private readonly scene: ModelScene,
     private readonly canvas: HTMLCanvasElement,
-  ) {
-    this.button.addEventListener("click", () => this.toggle());
-  }
+  ) {}
 
-  toggle(): void {
+  private toggle(): void {
     if (this.on) this.end();
     else this.begin();
   }
@@ -40,7 +39,7 @@ export class MeasureTool implements Tool {
     this.scene.use(null);
     this.scene.removeLayer(this.drawing);
     document.removeEventListener("keydown", this.escaped, true);
-    this.button.setAttribute("aria-pressed", "false");
+    setPressed(this.button, false);
     this.card.hidden = this.cross.hidden = true;
     announce("Measuring has ended.");
   }
@@ -82,7 +81,7 @@ export class MeasureTool implements Tool {
     this.scene.use(this);
     this.scene.addLayer(this.drawing);
     document.addEventListener("keydown", this.escaped, true);
-    this.button.setAttribute("aria-pressed", "true");
+    setPressed(this.button, true);
     this.card.hidden = false;
     this.drawing.show([]);
     this.write([]);
@@ -101,7 +100,7 @@ export class MeasureTool implements Tool {
     this.scene.request();
     const [from, to] = this.places;
     if (to === undefined) announce("First place set.");
-    else announce(inWords(measured(from.toArray(), to.toArray())).map((pair) => pair.join(" ")).join(", "));
+    else announce(measured(from, to).map((pair) => pair.join(" ")).join(", "));
   }
 
   private write([from, to]: readonly Vector3[]): void {
@@ -110,8 +109,7 @@ export class MeasureTool implements Tool {
       this.card.replaceChildren(el("p", {}, hint, el("span", { class: "hint" }, " · Esc ends")));
       return;
     }
-    const rows = inWords(measured(from.toArray(), to.toArray())).flatMap(([name, figure]) => [el("dt", {}, name), el("dd", {}, figure)]);
-    this.card.replaceChildren(el("dl", {}, ...rows));
+    this.card.replaceChildren(facts({}, ...measured(from, to)));
   }
 
   private underCross(): Vector3 | null {
@@ -139,4 +137,17 @@ export class MeasureTool implements Tool {
 
 function held(share: number): number {
   return Math.min(Math.max(share, 0), 1);
+}
+
+/** Distances between two places in metres, and the angle of the line above the horizontal. */
+export function measured(from: Vector3, to: Vector3): [string, string][] {
+  const horizontal = Math.hypot(to.x - from.x, to.y - from.y);
+  const height = to.z - from.z;
+  const sign = height > 0.005 ? "+" : "";
+  return [
+    ["Horizontal distance", measure(horizontal, 2, "m")],
+    ["Height difference", sign + measure(height, 2, "m")],
+    ["Slope distance", measure(from.distanceTo(to), 2, "m")],
+    ["Inclination", measure((Math.atan2(height, horizontal) * 180) / Math.PI, 1, "°")],
+  ];
 }

@@ -1,8 +1,11 @@
-import { ofRun, request, serviceUrl } from "../api/requests";
+import { ofRun, Problem, request, serviceUrl } from "../api/requests";
 import { originInMetres, type SceneFrame } from "../models/building_mesh";
+import type { RunObjects } from "../models/run_objects";
 import { colourSwatch, el } from "../page/elements";
-import { announce, asProblem } from "../page/notices";
-import { legendLines, POINT_COLOURING_NAMES, POINT_COLOURINGS, type PointColouring } from "../points/points_colouring";
+import { choice } from "../page/form_fields";
+import { announce, asProblem, problemNotice } from "../page/notices";
+import { Tick } from "../page/tick";
+import { legendLines, POINT_COLOURINGS, type PointColouring } from "../points/points_colouring";
 import { PointsLayer, type Figures } from "../points/points_layer";
 import { factsOf, rootOf, type RawTileset, type TilesetFacts, type Xyz } from "../points/points_tileset";
 import type { ModelScene } from "../scene/scene";
@@ -14,11 +17,7 @@ const BUDGET_OF_PHONES = 1_000_000;
 /** The points of a job over its models: they are loaded as the view needs them. */
 export class PointsPanel {
   readonly element: HTMLElement;
-  private readonly choice = el(
-    "select",
-    { id: "point-colouring" },
-    ...POINT_COLOURING_NAMES.map((name) => el("option", { value: name }, POINT_COLOURINGS[name])),
-  );
+  private readonly choice = choice("point-colouring", POINT_COLOURINGS);
   private readonly legend = el("div", { class: "points-legend", role: "group", "aria-label": "Shown points" });
   private readonly figure = el("span", { class: "points-figure" });
   private readonly fault = el("div");
@@ -30,10 +29,9 @@ export class PointsPanel {
    *
    * @throws Problem if the service does not give it, Error if it cannot be read.
    */
-  static async open(scene: ModelScene, jobPath: string, method: string | null, frame: SceneFrame): Promise<PointsPanel> {
+  static async open(scene: ModelScene, { jobPath, method, frame }: RunObjects): Promise<PointsPanel> {
     const get = async (address: string, signal?: AbortSignal): Promise<ArrayBuffer> => {
-      const options: RequestInit = { headers: { Accept: "*/*" }, cache: "default" };
-      if (signal !== undefined) options.signal = signal;
+      const options = { headers: { Accept: "*/*" }, cache: "default" as const, signal: signal ?? null };
       return (await request(ofRun(address, method), options)).arrayBuffer();
     };
     const address = serviceUrl(`${jobPath}/points/tileset.json`);
@@ -87,25 +85,22 @@ export class PointsPanel {
 
   private colour(): void {
     const { material } = this.layer;
-    const [low, high] = this.scene.heights();
+    const [low, high] = this.scene.models.heights();
     const base = this.frame.origin[2] * this.frame.verticalUnitM;
     material.colourBy(this.colouring);
     material.uniforms["heights"].value = [low, high];
     const lines = legendLines(this.colouring, this.facts.classes, [low + base, high + base]);
     this.legend.replaceChildren(
-      ...lines.map(({ colours, label, numbers, count: n }, i) => {
-        const words = [
-          ...colours.map((colour) => colourSwatch(colour)),
-          el("span", { class: "legend-label" }, label),
-          n === null ? null : el("span", { class: "tally" }, count(n)),
-        ];
-        if (numbers.length === 0) return el("div", { class: "legend-row" }, ...words);
-        const box = el("input", { type: "checkbox", id: `points-${i}`, checked: true });
-        box.addEventListener("change", () => {
-          material.show(numbers, box.checked);
+      ...lines.map(({ colours, label, numbers, count: n }) => {
+        const signs = colours.map((colour) => colourSwatch(colour));
+        if (numbers.length === 0) return el("div", { class: "legend-row" }, ...signs, el("span", { class: "legend-label" }, label));
+        const show = (on: boolean): void => {
+          material.show(numbers, on);
           this.scene.request();
-        });
-        return el("label", { class: "legend-row", for: box.id }, box, ...words);
+        };
+        const tick = new Tick(label, show, signs, { class: "legend-row" });
+        tick.set(true, n);
+        return tick.row;
       }),
     );
     this.scene.request();
@@ -117,13 +112,11 @@ export class PointsPanel {
   }
 
   private report(fault: unknown): void {
-    const again = el("button", { type: "button", class: "quiet" }, "Try again");
-    again.addEventListener("click", () => {
+    const again = (): void => {
       this.fault.replaceChildren();
       this.layer.retry();
       this.scene.request();
-    });
-    const words = `Some points could not be read: ${asProblem(fault).message}`;
-    this.fault.replaceChildren(el("div", { class: "notice notice-error", role: "alert" }, el("p", {}, words), again));
+    };
+    this.fault.replaceChildren(problemNotice(new Problem(0, "Some points could not be read", asProblem(fault).message, ""), again));
   }
 }

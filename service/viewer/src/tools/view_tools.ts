@@ -1,6 +1,7 @@
-import { getJson, ofRun } from "../api/requests";
-import { originInMetres, type SceneFrame } from "../models/building_mesh";
-import { el } from "../page/elements";
+import { getJson, partOf } from "../api/requests";
+import { originInMetres } from "../models/building_mesh";
+import type { RunObjects } from "../models/run_objects";
+import { button, el, isPressed, setPressed } from "../page/elements";
 import { announce, asProblem, problemNotice } from "../page/notices";
 import { factsOf, type RawTileset } from "../points/points_tileset";
 import { groundOf, type TerrainFile } from "../scene/ground";
@@ -15,12 +16,14 @@ export class ViewTools {
   readonly element = el("div", { class: "tool-group switches", role: "group", "aria-label": "Show and measure", hidden: true });
   /** Lies over the canvas. */
   readonly cards = el("div", { class: "stage-cards" });
-  private readonly points = el("button", { type: "button", title: "Show the points over the models", "aria-pressed": "false" }, "Points");
+  private readonly points = button("Points", () => void this.togglePoints(), { title: "Show the points over the models", "aria-pressed": "false" });
   private readonly fault = el("div", { class: "stage-fault" });
   private readonly calledOff = new AbortController();
   private scene: ModelScene | null = null;
   private measuring: MeasureTool | null = null;
   private panel: PointsPanel | null = null;
+
+  constructor(private readonly run: RunObjects) {}
 
   /** All buttons over the view: these and some more. */
   bar(...more: HTMLElement[]): HTMLElement {
@@ -38,44 +41,42 @@ export class ViewTools {
   attach(scene: ModelScene, canvas: HTMLCanvasElement): void {
     this.scene = scene;
     this.measuring = new MeasureTool(scene, canvas);
-    const ground = el("button", { type: "button", title: "Show the ground", "aria-pressed": "true" }, "Ground");
-    ground.addEventListener("click", () => {
-      const shown = ground.getAttribute("aria-pressed") !== "true";
-      ground.setAttribute("aria-pressed", String(shown));
+    const toggle = (): void => {
+      const shown = !isPressed(ground);
+      setPressed(ground, shown);
       scene.showGround(shown);
       announce(shown ? "The ground is shown." : "The ground is hidden.");
-    });
+    };
+    const ground = button("Ground", toggle, { title: "Show the ground", "aria-pressed": "true" });
     this.element.replaceChildren(ground, this.measuring.button);
     this.element.hidden = false;
     this.cards.replaceChildren(this.fault, this.measuring.card);
     canvas.after(this.measuring.cross);
   }
 
-  /** Offer the points of the job, or of one run of a comparison, and draw their terrain, if it has any. */
-  async offerPoints(jobPath: string, method: string | null, frame: SceneFrame): Promise<void> {
+  /** Offer the points of the run, and draw their terrain, if it has any. */
+  async offerPoints(): Promise<void> {
     await this.tried(async (signal) => {
-      const outputs = await getJson<Record<string, unknown>>(ofRun(`${jobPath}/results`, method), { signal });
-      this.fault.replaceChildren();
+      const outputs = await getJson<Record<string, unknown>>(partOf(this.run, "results"), { signal });
       if (!("tileset" in outputs)) return;
-      this.points.addEventListener("click", () => void this.togglePoints(jobPath, method, frame));
       this.element.prepend(this.points);
-      await this.tried((again) => this.layTerrain(jobPath, method, frame, again));
+      await this.tried((again) => this.layTerrain(again));
     });
   }
 
-  /** Draw the terrain of a job with points; runs of earlier versions have none. */
-  private async layTerrain(jobPath: string, method: string | null, frame: SceneFrame, signal: AbortSignal): Promise<void> {
-    const tileset = await getJson<RawTileset>(ofRun(`${jobPath}/points/tileset.json`, method), { signal });
+  /** Draw the terrain of a run with points; those of earlier versions have none. */
+  private async layTerrain(signal: AbortSignal): Promise<void> {
+    const tileset = await getJson<RawTileset>(partOf(this.run, "points/tileset.json"), { signal });
     const file = factsOf(tileset).terrain;
-    const terrain = file === null ? null : await getJson<TerrainFile>(ofRun(`${jobPath}/points/${file}`, method), { signal });
-    this.fault.replaceChildren();
-    const ground = terrain === null ? null : groundOf(terrain, originInMetres(frame));
-    if (ground !== null && !signal.aborted) this.scene?.layTerrain(ground);
+    const terrain = file === null ? null : await getJson<TerrainFile>(partOf(this.run, `points/${file}`), { signal });
+    const ground = terrain === null ? null : groundOf(terrain, originInMetres(this.run.frame));
+    if (ground !== null && !signal.aborted) this.scene?.lay(ground, false);
   }
 
   /** Do something that may fail, and offer to try it again. */
   private async tried(step: (signal: AbortSignal) => Promise<void>): Promise<void> {
     const { signal } = this.calledOff;
+    this.fault.replaceChildren();
     try {
       await step(signal);
     } catch (error) {
@@ -90,30 +91,26 @@ export class ViewTools {
     this.panel?.close();
   }
 
-  private async togglePoints(jobPath: string, method: string | null, frame: SceneFrame): Promise<void> {
+  private async togglePoints(): Promise<void> {
     const { scene } = this;
     if (scene === null || this.points.getAttribute("aria-busy") === "true") return;
     if (this.panel !== null) {
       this.panel.close();
       this.panel = null;
-      this.points.setAttribute("aria-pressed", "false");
+      setPressed(this.points, false);
       announce("The points are hidden.");
       return;
     }
     this.points.setAttribute("aria-busy", "true");
-    this.fault.replaceChildren();
-    try {
+    await this.tried(async (signal) => {
       // the code of the points is loaded only if they are shown
       const { PointsPanel } = await import("./points_panel");
-      const panel = await PointsPanel.open(scene, jobPath, method, frame);
-      if (this.calledOff.signal.aborted) return panel.close();
+      const panel = await PointsPanel.open(scene, this.run);
+      if (signal.aborted) return panel.close();
       this.panel = panel;
       this.cards.append(panel.element);
-      this.points.setAttribute("aria-pressed", "true");
-    } catch (error) {
-      if (!this.calledOff.signal.aborted) this.fault.replaceChildren(problemNotice(asProblem(error)));
-    } finally {
-      this.points.removeAttribute("aria-busy");
-    }
+      setPressed(this.points, true);
+    });
+    this.points.removeAttribute("aria-busy");
   }
 }

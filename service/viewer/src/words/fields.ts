@@ -1,6 +1,6 @@
 /** The words of the service for readers of the page: labels of fields in place of inputs of a process. */
 
-import { TABLES } from "./tables";
+import { TABLES } from "../words/tables";
 
 /** A message that names fields in place of inputs, and no settings of the operator. */
 export function inFields(message: string): string {

@@ -3,7 +3,7 @@
 const NARROW = "\u202f";
 
 export function count(value: number): string {
-  return Math.round(value).toString().replace(/\B(?=(\d{3})+$)/g, NARROW);
+  return measure(value, 0);
 }
 
 /** `1 building`, `2 buildings`. */
@@ -13,9 +13,8 @@ export function counted(value: number, noun: string): string {
 
 export function measure(value: unknown, digits: number, unit = ""): string {
   if (typeof value !== "number" || !Number.isFinite(value)) return "–";
-  const [whole, fraction] = Math.abs(value).toFixed(digits).split(".");
-  const sign = value < 0 && Number(value.toFixed(digits)) !== 0 ? "−" : "";
-  const text = sign + whole.replace(/\B(?=(\d{3})+$)/g, NARROW) + (fraction === undefined ? "" : `.${fraction}`);
+  const places = { minimumFractionDigits: digits, maximumFractionDigits: digits, signDisplay: "negative" } as const;
+  const text = value.toLocaleString("en", places).replaceAll(",", NARROW).replace("-", "−");
   return unit === "" ? text : `${text}${NARROW}${unit}`;
 }
 
@@ -39,8 +38,9 @@ export function duration(seconds: number): string {
 }
 
 /** `just now`, `5 min ago`, `3 h ago`, else the date. */
-export function ago(then: Date, now: Date): string {
-  const seconds = (now.getTime() - then.getTime()) / 1000;
+export function ago(time: string): string {
+  const then = new Date(time);
+  const seconds = (Date.now() - then.getTime()) / 1000;
   if (seconds < 60) return "just now";
   if (seconds < 3600) return `${Math.floor(seconds / 60)}${NARROW}min ago`;
   if (seconds < 86_400) return `${Math.floor(seconds / 3600)}${NARROW}h ago`;

@@ -1,4 +1,4 @@
-import { TABLES } from "./tables";
+import { TABLES } from "../words/tables";
 
 /** Why an object is not a building, or has no model of its own kind, in plain words. */
 export function reasonWords(reason: string): string {

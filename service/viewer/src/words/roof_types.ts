@@ -37,9 +37,3 @@ export function isHatched(category: Category): boolean {
 export function isFlat(category: Category): boolean {
   return category === "failed" || category === "rejected";
 }
-
-/** The sRGB bytes of `#rrggbb`. */
-export function bytesOf(colour: string): [number, number, number] {
-  const value = Number.parseInt(colour.slice(1), 16);
-  return [(value >> 16) & 255, (value >> 8) & 255, value & 255];
-}

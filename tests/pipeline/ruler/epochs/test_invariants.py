@@ -10,7 +10,6 @@ from epochs_by_hand import ORIGIN, by_name, compared, failed, house, write_epoch
 
 from pipeline.model import BuildingResult
 from pipeline.ruler.epochs import comparing, matching
-from pipeline.ruler.epochs.settings import DiffSettings
 from pipeline.ruler.simulation.roofs import RoofShape
 
 MIRRORED = {
@@ -161,19 +160,3 @@ def test_candidates_without_geometry_come_last_and_are_not_lost(tmp_path: Path) 
     assert (last["old_ids"], last["reason"], last["geometry"], last["bbox"]) == (["z1"], "failed_in_old", None, None)
     names = [name for row in table.to_pylist() for name in (*row["old_ids"], *row["new_ids"])]
     assert sorted(names) == sorted(one.building_id for one in (nowhere, *old, *new))
-
-
-def test_parts_hold_every_place_once_and_do_not_depend_on_the_order() -> None:
-    random = np.random.default_rng(3)
-    places = np.concatenate([random.uniform(0.0, 1000.0, (500, 2)), np.tile([[5.0, 5.0]], (40, 1)), [[np.nan, np.nan]]])
-    parts = [part.tolist() for part in matching.parts_of(places, 25)]
-    assert sorted(k for part in parts for k in part) == list(range(541))
-    assert all(len(part) <= 25 or np.ptp(places[part], axis=0).max() == 0.0 for part in parts)
-    turned = random.permutation(541)
-    again = [sorted(turned[part].tolist()) for part in matching.parts_of(places[turned], 25)]
-    assert again == [sorted(part) for part in parts]
-
-
-def test_settings_are_mirrored_by_their_shift_alone() -> None:
-    settings = DiffSettings(vertical_shift_m=0.4)
-    assert settings.swapped() == DiffSettings(vertical_shift_m=-0.4)

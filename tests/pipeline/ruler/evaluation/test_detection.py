@@ -17,11 +17,7 @@ from pipeline.ruler.evaluation.building_raster import (
     CellWindow,
     PlanRaster,
     PointRaster,
-    dilated,
-    edge_ring,
-    eroded,
     outlines_of,
-    windows_of,
 )
 from pipeline.ruler.evaluation.detection import DEFINITIONS, Detection, detect, detection_measures
 from pipeline.ruler.evaluation.measure import Measure
@@ -62,15 +58,6 @@ EXTENT = shapely.box(980, 1980, 1300, 2100)
 
 
 # ------------------------------------------------------------------------------------------------------------ raster
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_the_steps_are_those_of_scipy(seed: int) -> None:
-    cells = np.random.default_rng(seed).random((40, 50)) < 0.5
-    assert (dilated(cells) == ndimage.binary_dilation(cells, CROSS)).all()
-    assert (eroded(cells) == ndimage.binary_erosion(cells, CROSS, border_value=1)).all()
-    ring = ndimage.binary_dilation(cells, CROSS) & ~ndimage.binary_erosion(cells, CROSS, border_value=1)
-    assert (edge_ring(cells) == ring).all()
 
 
 def plain_raster(xyz: FloatArray, is_building: BoolArray, window: CellWindow) -> BoolArray:
@@ -122,17 +109,6 @@ def test_outlines_are_the_exact_borders_of_what_hangs_together() -> None:
         assert sorted(o.area / CELL_M**2 for o in outlines) == sorted(np.bincount(labels.ravel())[1:].tolist())
 
 
-def test_an_outline_has_holes_and_corners_only() -> None:
-    cells = np.ones((6, 8), bool)
-    cells[2:4, 3:5] = False
-    rows, columns = np.nonzero(cells)
-    (outline,) = outlines_of(np.column_stack((rows, columns, columns + 1)).astype(np.int64))
-    assert outline.area == 44 * CELL_M**2
-    assert len(outline.interiors) == 1
-    assert shapely.get_num_coordinates(outline.exterior) == 5
-    assert outlines_of(np.zeros((0, 3), np.int64)) == []
-
-
 @pytest.mark.parametrize("seed", range(4))
 def test_a_polygon_fills_the_cells_whose_centre_it_holds(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -148,11 +124,6 @@ def test_a_polygon_fills_the_cells_whose_centre_it_holds(seed: int) -> None:
     expected = np.any([shapely.contains_xy(shape, x, y) for shape in shapes], axis=0)
     assert (PlanRaster(shapes).window(window) == expected).all()
     assert not PlanRaster([]).window(window).any()
-
-
-def test_windows_of_far_apart_areas_are_few() -> None:
-    bounds = np.array([(0.0, 0.0, 10.0, 10.0), (5e6, 5e6, 5e6 + 300.0, 5e6 + 10.0)])
-    assert len(windows_of(bounds)) < 12
 
 
 # ----------------------------------------------------------------------------------------------------------- by area

@@ -5,7 +5,6 @@ import itertools
 
 import numpy as np
 import pytest
-import roofs_by_hand as by_hand
 import shapely
 from damaged_suburb import model_set
 from roofs_by_hand import flat, gable, reference
@@ -16,7 +15,6 @@ from pipeline.ruler.evaluation.divisions import MIN_PART_IOU, whole_models
 from pipeline.ruler.evaluation.evaluate import Evaluation, evaluate
 from pipeline.ruler.evaluation.models import RoofModel
 from pipeline.ruler.evaluation.tables import ROLES
-from pipeline.ruler.simulation.town import town
 
 WALLS = (0.0, 6.0, 12.0, 18.0, 24.0)
 DEPTH_M = 8.0
@@ -138,18 +136,3 @@ def test_nothing_at_all_can_be_whole() -> None:
     assert whole_models(models, reference([])).models == tuple(models)
     nowhere = [dataclasses.replace(one, footprint=shapely.Polygon()) for one in models]
     assert whole_models(nowhere, TRUTH).divided == 0
-
-
-def test_the_truth_of_a_town_with_rows_is_perfect_against_itself() -> None:
-    """No model follows given footprints, so rows are joined; their own houses must not be worse than one model."""
-    scene = town(11, size_m=(220.0, 180.0))
-    buildings = by_hand.models_of_scene(scene)
-    models = [dataclasses.replace(one, source_id=None) for one in buildings]
-    truth = reference(buildings, extent=shapely.union_all([one.footprint for one in buildings]).envelope.buffer(10.0))
-    found = evaluate(model_set(models), truth)
-    blocks = {one.source_id or one.building_id for one in buildings}
-    assert len(blocks) < len(buildings)
-    assert found.measure("delivery.lod2").n == len(blocks)
-    for name in ("delivery.lod2", "roof_types.correct", "footprints.iou_from_90", "faces.completeness_10m2"):
-        assert figure(found, name) == 1.0, name
-    assert figure(found, "delivery.split") == 0.0

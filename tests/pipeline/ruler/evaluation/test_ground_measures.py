@@ -22,7 +22,6 @@ from pipeline.ruler.evaluation.ground import (
     GroundOfRun,
     ground_blocks,
     ground_measures,
-    kept_points,
     matched_points,
     tile_figures,
 )
@@ -112,12 +111,6 @@ def test_kappa_is_that_of_the_formula_over_single_points() -> None:
     assert measured["ground.type_1"].n == truth.sum()
     for measure in measured.values():
         assert measure.low < measure.value < measure.high
-
-
-def test_perfect_labels_have_no_error_and_kappa_one() -> None:
-    xyz, is_ground = hilly(500)
-    figures = figures_of(ground_blocks(reference_of([tile(xyz, is_ground)]), lambda _: is_ground))
-    assert (figures.type_1, figures.type_2, figures.total, figures.kappa) == (0.0, 0.0, 0.0, 1.0)
 
 
 def test_only_last_returns_are_judged_and_neither_noise_nor_water() -> None:
@@ -251,16 +244,6 @@ def test_the_ground_of_a_run_does_not_depend_on_the_tiles() -> None:
     found = GroundOfRun(reference_of(parts), SETTINGS)
     assert (found(parts[0]) == labels[west]).all()
     assert (found(parts[1]) == labels[~west]).all()
-
-
-def test_outliers_are_the_same_window_by_window(monkeypatch: pytest.MonkeyPatch) -> None:
-    xyz, _ = hilly(3000)
-    x, y, z = np.rint(xyz.T * 1000).astype(np.int64)
-    at_once = kept_points(x, y, z, SETTINGS.outliers)
-    monkeypatch.setattr(ground, "_WHOLE_POINTS", 100)
-    monkeypatch.setattr(ground, "WINDOW_CELLS", 37)
-    assert (kept_points(x, y, z, SETTINGS.outliers) == at_once).all()
-    assert 0 < (~at_once).sum() < 100
 
 
 def test_samples_of_the_benchmark_stay_within_what_was_measured(shared_data: Path) -> None:

@@ -120,6 +120,8 @@ def test_the_truth_against_itself_is_perfect_in_every_measure(undamaged: Evaluat
         and not is_perfect(measure)
     }
     assert imperfect == {}
+    measured = {measure.name for measure in undamaged.measures}
+    assert {name for name in DEFINITIONS if not name.startswith(("ground.", "wireframes."))} == measured
 
 
 def test_points_lie_about_the_truth_by_their_noise(undamaged: Evaluation) -> None:

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import roofs_by_hand as by_hand
 import shapely
-from roofs_by_hand import flat, gable, reference
+from roofs_by_hand import gable, reference
 
 from pipeline.model import RoofType
-from pipeline.ruler.evaluation.matching import match_footprints, one_to_one, overlapping, sound_polygons
+from pipeline.ruler.evaluation.matching import match_footprints, one_to_one, sound_polygons
 from pipeline.ruler.evaluation.models import RoofModel
 from pipeline.ruler.evaluation.subsets import subsets, summed_over_units
 
@@ -20,16 +20,6 @@ def outlined(name: str, footprint: shapely.Geometry) -> RoofModel:
 
 def outlines(footprints: list[shapely.Geometry]) -> list[RoofModel]:
     return [outlined(str(number), one) for number, one in enumerate(footprints)]
-
-
-def test_the_truth_matches_itself_in_order() -> None:
-    buildings = [gable("a"), gable("b", 20.0), flat("c", 40.0)]
-    matching = match_footprints(buildings, reference(buildings))
-    assert matching.model_of.tolist() == matching.reference_of.tolist() == matching.mostly_on.tolist() == [0, 1, 2]
-    assert (
-        matching.iou.tolist() == matching.share_on_reference.tolist() == matching.share_in_extent.tolist() == [1.0] * 3
-    )
-    assert matching.model_m2.tolist() == pytest.approx([96.0, 96.0, 80.0])
 
 
 def test_each_model_stands_for_one_building_and_the_best_overlap_wins() -> None:
@@ -106,12 +96,6 @@ def test_random_footprints_match_as_in_naive_loops(seed: int) -> None:
     for t, one in enumerate(true):
         over = [m for m, other in enumerate(models) if one.intersection(other).area > 1e-6]
         assert matching.overlaps.second[matching.overlaps.first == t].tolist() == over
-
-
-def test_the_centroid_of_the_common_area_comes_with_the_pair() -> None:
-    pairs = overlapping(sound_polygons([shapely.box(0, 0, 4, 4)]), sound_polygons([shapely.box(3, 2, 9, 9)]))
-    assert pairs.common_m2.tolist() == [2.0]
-    assert pairs.middle.tolist() == [[3.5, 3.0]]
 
 
 def test_one_to_one_takes_the_largest_and_then_the_smaller_index() -> None:

@@ -10,26 +10,16 @@ from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.model import FaceKind, FloatArray, IntArray
-from pipeline.ruler.evaluation.reading.coplanar import ANGLE_DEG, DISTANCE_M, coplanar_regions, face_vectors
+from pipeline.model import FaceKind, FloatArray
+from pipeline.ruler.evaluation.reading.coplanar import area_vector, coplanar_regions
 from pipeline.ruler.evaluation.reading.raw import RawFace, connected, grouped, is_closed, kind_in_name, raw_part
 
 Triangles = list[tuple[int, int, int]]
 
 
-def arrays(faces: list[list[tuple[int, ...]]]) -> tuple[IntArray, IntArray, IntArray]:
-    """Corners, ring offsets and face offsets of faces given as rings."""
-    rings = [ring for face in faces for ring in face]
-    offsets = np.concatenate([[0], np.cumsum([len(ring) for ring in rings])]).astype(np.int64)
-    of_faces = np.concatenate([[0], np.cumsum([len(face) for face in faces])]).astype(np.int64)
-    return np.array([index for ring in rings for index in ring], np.int64), offsets, of_faces
-
-
 def regions(xyz: FloatArray, faces: list[list[tuple[int, ...]]], planes: list[int] | None = None) -> list[int]:
-    corners, ring_offsets, face_rings = arrays(faces)
-    vectors = face_vectors(xyz, corners, ring_offsets, face_rings)
-    numbers = np.array(planes or [-1] * len(faces), np.int64)
-    return coplanar_regions(xyz, corners, ring_offsets, face_rings, vectors, numbers, DISTANCE_M, ANGLE_DEG).tolist()
+    points = xyz.tolist()
+    return coplanar_regions(points, faces, [area_vector(points, rings) for rings in faces], planes or [-1] * len(faces))
 
 
 def lattice(columns: int, rows: int, step_m: float) -> tuple[FloatArray, Triangles]:
@@ -142,7 +132,7 @@ def test_area_vectors_are_those_of_the_polygon_in_plan(corners: list[tuple[int, 
     xy = np.vstack([plan, hole])
     xyz = np.column_stack([xy, a * xy[:, 0] + b * xy[:, 1] + 4.0])
     n = len(plan)
-    (vector,) = face_vectors(xyz, *arrays([[tuple(range(n)), tuple(range(n, 2 * n))]]))
+    vector = area_vector(xyz.tolist(), [range(n), range(n, 2 * n)])
     area = shapely.Polygon(plan).area * (1.0 - 0.25**2) * np.sign(shapely.LinearRing(plan).is_ccw - 0.5)
     if shapely.Polygon(plan).is_valid:
         assert np.allclose(vector, np.array([-a, -b, 1.0]) * area, rtol=1e-9, atol=1e-6)

@@ -13,12 +13,10 @@ import pytest
 import shapely
 
 from pipeline.errors import InconsistentInputError, InputError
-from pipeline.ruler.evaluation.detection import detect, detection_measures
 from pipeline.ruler.evaluation.reading import read_models
 from pipeline.ruler.evaluation.reference import Reference
 from pipeline.ruler.evaluation.reference_truth import read_truth_reference
-from pipeline.ruler.evaluation.residuals import building_residuals, residual_measures
-from pipeline.ruler.evaluation.subsets import subsets
+from pipeline.ruler.evaluation.residuals import building_residuals
 from pipeline.ruler.simulation.dataset import simulate
 
 
@@ -92,26 +90,6 @@ def test_conditions_and_extent_come_with_it(town: Path, reference: Reference) ->
         assert reference.conditions[building.building_id].good == row["good"]
         for surface in building.surfaces:
             assert surface.group == row["groups"][surface.plane_id]
-
-
-def test_the_truth_scored_against_itself_misses_nothing(town: Path, reference: Reference) -> None:
-    models = read_models(town).models
-    everything = subsets(reference)[0]
-    measured = {
-        m.name: m
-        for m in (
-            *residual_measures(building_residuals(models, reference), everything),
-            *detection_measures(detect(models, reference), everything),
-        )
-    }
-    assert measured["residuals.coverage"].value == 1.0
-    # what is left is the noise of the survey and pulses that hit two surfaces
-    assert measured["residuals.within_0_2m"].value > 0.98
-    assert measured["residuals.median"].value < 0.03
-    assert abs(measured["residuals.bias"].value) < 0.01
-    detection = [m for m in measured.values() if m.name.startswith("detection.")]
-    assert detection
-    assert all(m.value == 1.0 for m in detection)
 
 
 def test_a_data_set_of_two_tiles_is_the_same_reference(town: Path, reference: Reference, tmp_path: Path) -> None:

@@ -14,7 +14,6 @@ from pipeline.ruler.evaluation.matching import match_footprints
 from pipeline.ruler.evaluation.models import RoofModel
 from pipeline.ruler.evaluation.reference import Reference
 from pipeline.ruler.evaluation.roof_types import (
-    DEFINITIONS,
     Outcome,
     confusion,
     measures,
@@ -41,19 +40,6 @@ def figures_of(models: list[RoofModel], truth: Reference) -> dict[str, float]:
 
 def replaced(place: int, one: RoofModel) -> list[RoofModel]:
     return [*TRUTH[:place], one, *TRUTH[place + 1 :]]
-
-
-@pytest.mark.parametrize("buildings", [TRUTH, [gable("only")]])
-def test_the_truth_scored_against_itself_is_perfect(buildings: list[RoofModel]) -> None:
-    figures = figures_of(buildings, reference(buildings))
-    assert {name for name, value in figures.items() if value == 1.0} == {
-        "correct",
-        "accuracy",
-        "accuracy_found",
-        "kappa",
-    }
-    assert {name for name, value in figures.items() if value == 0.0} == {"passable", "false"}
-    assert {f"roof_types.{name}" for name in figures} == {one.name for one in DEFINITIONS}
 
 
 def test_a_lost_face_makes_a_building_passable_and_too_many_make_it_false() -> None:

@@ -14,7 +14,7 @@ from pipeline.ruler.evaluation import residuals
 from pipeline.ruler.evaluation.models import RoofModel
 from pipeline.ruler.evaluation.reference import Reference
 from pipeline.ruler.evaluation.subsets import subsets
-from pipeline.ruler.evaluation.surface import DEFINITIONS, EDGES_M, lattice_over, measures, score_surface
+from pipeline.ruler.evaluation.surface import EDGES_M, measures, score_surface
 from pipeline.ruler.simulation.suburb import suburb
 
 TRUTH = [gable("a"), hip("b", 20.0), flat("c", 40.0)]
@@ -28,17 +28,6 @@ def rows_of(models: list[RoofModel], truth: Reference, **more: float) -> list[Si
 
 def figures_of(models: list[RoofModel], truth: Reference, subset: int = 0) -> dict[str, float]:
     return by_hand.values(measures(score_surface(models, truth), subsets(truth)[subset]))
-
-
-@pytest.mark.parametrize("truth", [TRUTH, by_hand.models_of_scene(suburb(3, size_m=(100.0, 100.0)))])
-def test_the_truth_scored_against_itself_is_perfect(truth: list[RoofModel]) -> None:
-    figures = figures_of(truth, reference(truth))
-    assert {f"surface.{name}" for name in figures} == {one.name for one in DEFINITIONS}
-    assert figures["coverage"] == figures["within_0_2m"] == figures["within_0_2m_mean"] == 1.0
-    assert [figures[name] for name in ("median", "p95", "rmse", "bias")] == pytest.approx([0.0] * 4, abs=2e-6)
-    rows = rows_of(truth, reference(truth))
-    area = sum(one.footprint.area for one in truth)
-    assert sum(row.n_points for row in rows) * 0.0625 == pytest.approx(area, rel=0.01)
 
 
 @pytest.mark.parametrize(("lift", "within"), [(0.2, 1.0), (0.21, 0.0), (-0.3, 0.0)])
@@ -132,34 +121,11 @@ def test_pooled_quantiles_follow_the_places_within_a_bin() -> None:
     assert np.all(np.diff(EDGES_M) > 0.0)
 
 
-def test_the_lattice_does_not_depend_on_the_buildings() -> None:
-    x, _ = lattice_over([(0.1, 0.1, 3.9, 2.9)], 0.5)
-    assert len(x) == 8 * 6
-    assert np.allclose((x / 0.5 - 0.5) % 1, 0)
-    more, _ = lattice_over([(0.1, 0.1, 3.9, 2.9), (10.2, 0.0, 11.0, 1.0)], 0.5)
-    assert len(more) == 22 * 6
-    assert set(x.tolist()) <= set(more.tolist())
-    one, other = (rows_of([gable("m", slope=0.6)], reference(truth))[0] for truth in (TRUTH[:1], TRUTH))
-    assert (one.n_points, one.sum_m) == (other.n_points, pytest.approx(other.sum_m))
-
-
 def test_a_building_is_measured_by_its_own_roof_though_others_stand_within_its_bounds() -> None:
     row = [moved(gable(str(x), x), 0.0, 0.0, 0.0, 45.0) for x in (0.0, 12.0, 24.0)]
     rows = rows_of([row[0], moved(row[1], 0.0, 0.0, 1.0)], reference(row))
     assert [one.n_points * 0.0625 for one in rows] == pytest.approx([96.0] * 3, rel=0.01)
     assert [one.share_within for one in rows] == pytest.approx([1.0, 0.0, 0.0], abs=0.002)
-
-
-def test_buildings_batch_by_batch_give_what_all_at_once_give(monkeypatch: pytest.MonkeyPatch) -> None:
-    bare = dataclasses.replace(gable("bare", 80.0), surfaces=())
-    truth = reference([bare, *TRUTH, bare, gable("d", 100.0), bare])
-    models = [gable("m", lift=0.1), shrunk(TRUTH[1], 0.3), gable("n", 100.0, slope=0.65)]
-    whole = rows_of(models, truth)
-    for places in (1, 3000, 7000):
-        monkeypatch.setattr("pipeline.ruler.evaluation.surface._PLACES_A_BATCH", places)
-        for row, other in zip(rows_of(models, truth), whole, strict=True):
-            assert all(np.array_equal(value, vars(other)[name], equal_nan=True) for name, value in vars(row).items())
-    assert [row.n_points > 0 for row in whole] == [False, True, True, True, False, True, False]
 
 
 def test_the_data_edge_and_subsets_choose_the_buildings() -> None:

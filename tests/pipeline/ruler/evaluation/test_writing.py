@@ -10,12 +10,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import shapely
-from damaged_suburb import DEFINITIONS, KINDS, damaged_evaluation
+from damaged_suburb import KINDS, damaged_evaluation
 
 from pipeline.errors import RunError
 from pipeline.ruler.evaluation.chapters import chapters, printed
 from pipeline.ruler.evaluation.counts import breakdowns, count_tables
-from pipeline.ruler.evaluation.definitions import DEFINITIONS as ALL
+from pipeline.ruler.evaluation.definitions import DEFINITIONS
 from pipeline.ruler.evaluation.measure import Group, Measure
 from pipeline.ruler.evaluation.writing import markdown, measures_table, write_tables
 
@@ -30,7 +30,7 @@ def test_parquet_and_markdown_hold_every_measure_with_the_words_of_its_definitio
     kind: dict[str, bool], tmp_path: Path
 ) -> None:
     evaluation = damaged_evaluation(**kind)
-    written = write_tables(evaluation, tmp_path, DEFINITIONS)
+    written = write_tables(evaluation, tmp_path)
     rows = pq.read_table(tmp_path / "measures.parquet").to_pylist()
     assert [row["name"] for row in rows] == [measure.name for measure in evaluation.measures]
     text = (tmp_path / "report.md").read_text()
@@ -53,14 +53,14 @@ def test_parquet_and_markdown_hold_every_measure_with_the_words_of_its_definitio
 
 def test_tables_come_back_from_parquet_as_they_were(tmp_path: Path) -> None:
     evaluation = damaged_evaluation()
-    write_tables(evaluation, tmp_path, DEFINITIONS)
+    write_tables(evaluation, tmp_path)
     for name, table in evaluation.tables.items():
         assert pq.read_table(tmp_path / f"{name}.parquet").replace_schema_metadata(None).equals(table)
 
 
 def test_tables_with_geometries_are_geoparquet_with_their_reference_system(tmp_path: Path) -> None:
     evaluation = damaged_evaluation()
-    write_tables(evaluation, tmp_path, DEFINITIONS)
+    write_tables(evaluation, tmp_path)
     geo = json.loads(pq.read_schema(tmp_path / "true_faces.parquet").metadata[b"geo"])
     column = geo["columns"]["geometry"]
     assert column["crs"]["id"] == {"authority": "EPSG", "code": 28992}
@@ -69,14 +69,14 @@ def test_tables_with_geometries_are_geoparquet_with_their_reference_system(tmp_p
     assert column["geometry_types"] == ["Polygon"]
     assert evaluation.reference is not None
     feet = dataclasses.replace(evaluation.reference, crs="EPSG:2263")
-    write_tables(dataclasses.replace(evaluation, reference=feet), tmp_path, DEFINITIONS)
+    write_tables(dataclasses.replace(evaluation, reference=feet), tmp_path)
     geo = json.loads(pq.read_schema(tmp_path / "true_faces.parquet").metadata[b"geo"])
     assert geo["columns"]["geometry"]["crs"] is None, "coordinates are metres, those of the system are feet"
 
 
 def test_the_same_evaluation_gives_the_same_bytes(tmp_path: Path) -> None:
     for folder in ("one", "two"):
-        write_tables(damaged_evaluation(), tmp_path / folder, DEFINITIONS)
+        write_tables(damaged_evaluation(), tmp_path / folder)
     for path in (tmp_path / "one").iterdir():
         assert path.read_bytes() == (tmp_path / "two" / path.name).read_bytes()
 
@@ -84,7 +84,7 @@ def test_the_same_evaluation_gives_the_same_bytes(tmp_path: Path) -> None:
 def test_a_folder_that_cannot_be_made_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("not a folder")
     with pytest.raises(RunError, match="cannot be made"):
-        write_tables(damaged_evaluation(), tmp_path / "file", DEFINITIONS)
+        write_tables(damaged_evaluation(), tmp_path / "file")
 
 
 @pytest.mark.parametrize(
@@ -111,7 +111,7 @@ def test_a_figure_has_no_more_digits_than_its_interval_supports(one: Measure, va
 
 
 def test_chapters_have_the_order_of_the_groups_and_keep_subsets_together() -> None:
-    found = chapters(damaged_evaluation(), DEFINITIONS)
+    found = chapters(damaged_evaluation())
     groups = [chapter.group for chapter in found]
     assert groups == [group for group in Group if group in groups]
     types = next(chapter for chapter in found if chapter.group is Group.ROOF_TYPES)
@@ -123,28 +123,28 @@ def test_a_subset_with_nothing_in_it_is_not_printed_but_stays_in_the_table() -> 
     evaluation = damaged_evaluation()
     nothing = Measure(name="roof_types.correct", value=math.nan, n=0, subset="hard")
     evaluation = dataclasses.replace(evaluation, measures=(*evaluation.measures, nothing))
-    types = next(one for one in chapters(evaluation, DEFINITIONS) if one.group is Group.ROOF_TYPES)
+    types = next(one for one in chapters(evaluation) if one.group is Group.ROOF_TYPES)
     assert types.subsets == ("all", "without defects")
-    assert measures_table(evaluation, DEFINITIONS).to_pylist()[-1]["subset"] == "hard"
+    assert measures_table(evaluation).to_pylist()[-1]["subset"] == "hard"
 
 
 def test_a_measure_without_a_definition_is_a_fault() -> None:
     evaluation = dataclasses.replace(damaged_evaluation(), measures=(measure(0.5, name="no.such"),))
     with pytest.raises(KeyError, match=r"no\.such"):
-        markdown(evaluation, DEFINITIONS)
+        markdown(evaluation)
     with pytest.raises(KeyError, match=r"no\.such"):
-        measures_table(evaluation, DEFINITIONS)
+        measures_table(evaluation)
 
 
 def test_every_definition_has_its_own_name_that_starts_with_its_chapter() -> None:
-    assert len(ALL) > 80
-    for name, definition in ALL.items():
+    assert len(DEFINITIONS) > 80
+    for name, definition in DEFINITIONS.items():
         assert name == definition.name
         assert name.startswith(f"{definition.group.value}.")
         assert definition.formula
         assert "\n" not in definition.formula + definition.label
-    assert {definition.group for definition in ALL.values()} == set(Group)
-    labels = [(definition.group, definition.label) for definition in ALL.values()]
+    assert {definition.group for definition in DEFINITIONS.values()} == set(Group)
+    labels = [(definition.group, definition.label) for definition in DEFINITIONS.values()]
     assert len(set(labels)) == len(labels)
 
 
@@ -206,7 +206,7 @@ def test_what_was_not_measured_has_no_column() -> None:
 def test_markdown_neither_breaks_its_tables_nor_lets_html_through() -> None:
     evaluation = damaged_evaluation()
     nasty = dataclasses.replace(evaluation.models, name="a|b<script>\nx")
-    text = markdown(dataclasses.replace(evaluation, models=nasty), DEFINITIONS)
+    text = markdown(dataclasses.replace(evaluation, models=nasty))
     assert "<script" not in text
     assert "a\\|b&lt;script&gt; x" in text
     assert "One \\| note." in text

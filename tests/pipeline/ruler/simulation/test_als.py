@@ -43,12 +43,6 @@ def test_pulses_are_as_dense_as_asked_for(density: float) -> None:
     assert len(scan_all(FIELD, settings, 1)) / 1e4 == pytest.approx(density, rel=0.02)
 
 
-def test_no_part_of_a_field_is_left_out() -> None:
-    xyz = local(scan_all(FIELD, PLAIN, 1), FIELD)
-    counts, _, _ = np.histogram2d(xyz[:, 0], xyz[:, 1], bins=50, range=[(0, 100), (0, 100)])
-    assert counts.min() >= 18  # 32 are expected in 4 m2
-
-
 @pytest.mark.parametrize("noise_m", [0.0, 0.03, 0.1])
 def test_noise_over_level_ground_is_as_asked_for(noise_m: float) -> None:
     xyz = local(scan_all(FIELD, dataclasses.replace(PLAIN, range_noise_m=noise_m, altitude_m=5000.0), 1), FIELD)
@@ -154,8 +148,8 @@ def test_mixed_returns_stand_at_the_edges(block: ScanBlock) -> None:
     assert shapely.distance(shapely.force_2d(edges), at)[from_crown > 0.3].max() < 0.5
 
 
-def faces_fitted_to_their_points(shape: RoofShape) -> list[tuple[float, float, int]]:
-    """For each face with enough points: angle to the truth in degrees, error in its own deviations, points.
+def faces_fitted_to_their_points(shape: RoofShape) -> list[float]:
+    """The error of each face with enough points in its own deviations.
 
     Where only a part of a beam meets a face, the return lies on the beam's axis and not on the face: left out.
     """
@@ -170,24 +164,15 @@ def faces_fitted_to_their_points(shape: RoofShape) -> list[tuple[float, float, i
             continue
         design = np.column_stack([x, y, np.ones(len(x))])
         (a, b, _), *_ = np.linalg.lstsq(design, z, rcond=None)
-        normal = np.array([-a, -b, 1.0]) / np.sqrt(a * a + b * b + 1)
-        angle = float(np.degrees(np.arccos(min(1.0, float(normal @ np.array(plane.normal))))))
         covariance = np.linalg.inv(design.T @ design)[:2, :2] * suite.scanner.range_noise_m**2
         error = np.array([a - plane.a, b - plane.b])
-        found.append((angle, float(np.sqrt(error @ np.linalg.solve(covariance, error))), len(x)))
+        found.append(float(np.sqrt(error @ np.linalg.solve(covariance, error))))
     return found
-
-
-@pytest.mark.parametrize("shape", [RoofShape(name) for name in ("flat", "pent", "gable", "hip", "l_shape")])
-def test_at_4_points_and_3_cm_faces_fitted_to_their_points_have_the_true_slope(shape: RoofShape) -> None:
-    for angle, _, points in faces_fitted_to_their_points(shape):
-        assert points > 40
-        assert angle < 0.5
 
 
 @pytest.mark.parametrize("shape", [shape for shape in RoofShape if str(shape) in SUITES])
 def test_faces_fitted_to_their_points_are_as_near_to_the_truth_as_noise_allows(shape: RoofShape) -> None:
-    errors = [error for _, error, _ in faces_fitted_to_their_points(shape)]
+    errors = faces_fitted_to_their_points(shape)
     assert len(errors) >= 1
     assert max(errors) < 4.5  # Rayleigh: one of 25,000
 
@@ -223,20 +208,6 @@ def test_the_same_seed_gives_the_same_points_in_any_chunks_and_threads(block: Sc
         assert np.array_equal(part.face, block.face[at : at + len(part)])
         at += len(part)
     assert at == len(block)
-
-
-def test_another_seed_gives_other_points(block: ScanBlock) -> None:
-    other = scan_all(SUBURB, SUITES["suburb"].scanner, 4)
-    n = min(len(block), len(other))
-    assert (block.points.xyz[:n] == other.points.xyz[:n]).all(axis=1).mean() < 0.001
-
-
-@pytest.mark.slow
-def test_chunks_stay_small_however_large_the_scene() -> None:
-    scene = dataclasses.replace(FIELD, extent=(0.0, 0.0, 600.0, 600.0))
-    sizes = [len(part) for part in scan(scene, PLAIN, 1, chunk_points=200_000)]
-    assert sum(sizes) == pytest.approx(8 * 600 * 600, rel=0.02)
-    assert max(sizes) < 400_000
 
 
 def test_impossible_surveys_are_refused_with_all_faults() -> None:

@@ -15,9 +15,9 @@ from measured import printed_with_peak
 from pipeline.errors import InputError, SettingsError
 from pipeline.io import open_source
 from pipeline.ruler.evaluation.reading import read_models
-from pipeline.ruler.simulation.conditions import CONDITIONS
 from pipeline.ruler.simulation.dataset import Output, ScenePaths, simulate
 from pipeline.ruler.simulation.suites import SUITES
+from pipeline.ruler.simulation.truth_files import CONDITIONS
 
 SIZE = (110.0, 90.0)
 

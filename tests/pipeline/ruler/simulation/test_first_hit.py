@@ -4,46 +4,15 @@ import math
 
 import numpy as np
 import pytest
-import shapely
 from simulated import hits_of_lines, scene_on, top_surface
 
-from pipeline.ruler.simulation.first_hit import BOX, GROUND, ROOF, TREE, WALL, mixed_bits, uniform_of
+from pipeline.ruler.simulation.first_hit import GROUND, ROOF, TREE, WALL, mixed_bits, uniform_of
 from pipeline.ruler.simulation.scene import Scene, Terrain, Tree
 from pipeline.ruler.simulation.scene_arrays import scene_arrays
-from pipeline.ruler.simulation.solids import building_solid
 from pipeline.ruler.simulation.suites import SUITES
 
 SUBURB = SUITES["suburb"].make(2, (120.0, 120.0))
 TOWN = SUITES["town"].make(2, (120.0, 120.0))
-
-
-@pytest.mark.parametrize("scene", [SUBURB, TOWN], ids=["suburb", "town"])
-def test_the_surface_is_that_of_the_solids_faces(scene: Scene) -> None:
-    """The twin looks for each place in the polygons of the rounded solids, by shapely."""
-    x, y = np.random.default_rng(1).uniform(0, 120, (2, 6000))
-    places = shapely.points(x, y)
-    expected = scene.terrain.elevation(x, y)
-    owner, owner_face, near_border = np.full(6000, -1), np.full(6000, -1), np.zeros(6000, bool)
-    for number, building in enumerate(scene.buildings):
-        solid = building_solid(building)
-        for face in solid.faces:
-            if face.plane < 0:
-                continue
-            corners = solid.vertices[list(face.rings[0])]
-            polygon = shapely.Polygon(corners[:, :2])
-            inside = shapely.contains(polygon, places)
-            normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
-            offset = corners[0] @ normal
-            z = (offset - normal[0] * x[inside] - normal[1] * y[inside]) / normal[2]
-            expected[inside], owner[inside], owner_face[inside] = z, number, face.plane
-            near_border |= shapely.distance(polygon.exterior, places) < 0.003
-    hits = top_surface(scene, x, y)
-    clear = ~near_border & (hits.kind != BOX)
-    assert clear.sum() > 5500
-    assert np.abs(hits.z - expected)[clear].max() < 0.004
-    assert np.array_equal(hits.building[clear], owner[clear])
-    assert np.array_equal(hits.face[clear], owner_face[clear])
-    assert {GROUND, ROOF} <= set(hits.kind.tolist())
 
 
 @pytest.mark.slow

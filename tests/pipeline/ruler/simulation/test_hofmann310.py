@@ -14,7 +14,6 @@ import shapely
 from pipeline.errors import SettingsError
 from pipeline.model import RoofType
 from pipeline.ruler.simulation.als import scan_all
-from pipeline.ruler.simulation.conditions import terrain_slope_deg
 from pipeline.ruler.simulation.dataset import ScenePaths, simulate
 from pipeline.ruler.simulation.hofmann310 import SCANNER, hofmann310
 from pipeline.ruler.simulation.roofs import RoofShape
@@ -123,7 +122,7 @@ def test_no_building_stands_on_the_border_of_two_strips(scene: Scene) -> None:
 
 
 def test_the_ground_slopes_by_0_to_15_deg(scene: Scene) -> None:
-    slopes = np.array([terrain_slope_deg(scene.terrain, one.x, one.y) for one in scene.buildings])
+    slopes = np.array([scene.terrain.slope_deg(one.x, one.y) for one in scene.buildings])
     assert slopes.max() < 15.0
     assert np.percentile(slopes, 95) > 9.0
     assert slopes.min() < 3.0

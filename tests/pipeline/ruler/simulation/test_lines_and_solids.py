@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 import pytest
-import shapely
 from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -16,7 +15,7 @@ from pipeline.errors import SettingsError
 from pipeline.model import FaceKind, FloatArray, IntArray
 from pipeline.ruler.simulation.additions import can_have_dormers, random_dormers, random_superstructures
 from pipeline.ruler.simulation.als import ScannerSettings, scan_all
-from pipeline.ruler.simulation.first_hit import GROUND, ROOF, WALL
+from pipeline.ruler.simulation.first_hit import ROOF, WALL
 from pipeline.ruler.simulation.random_dimensions import random_dimensions
 from pipeline.ruler.simulation.roofs import RoofDimensions, RoofShape
 from pipeline.ruler.simulation.scene import Building, Scene, Terrain, undulating_terrain
@@ -130,39 +129,6 @@ def test_lines_hit_the_faces_of_the_closed_solid(shape: RoofShape) -> None:
         assert not np.isin(hits.kind[~does_hit], (ROOF, WALL)).any()
 
 
-def test_the_wall_between_a_higher_and_a_lower_roof_is_hit() -> None:
-    scene = scene_of(RoofShape.MULTI_LEVEL_FLAT, 3)
-    building = scene.buildings[0]
-    places, leans = aimed_lines(building, 20_000, 5)
-    hits = hits_of_lines(scene_arrays(scene, max_lean=LEAN), places, leans)
-    inner = shapely.distance(building.footprint.exterior, shapely.points(hits.xyz[:, :2])) > 0.1
-    steps = (hits.kind == WALL) & inner
-    assert steps.sum() > 50
-    assert (hits.building[steps] == 0).all()
-    assert (hits.face[steps] == -1).all()
-    levels = sorted(plane.c for plane in building.planes)
-    assert (hits.z[steps] > levels[0]).all()
-    assert (hits.z[steps] < levels[-1]).all()
-
-
-def test_the_ground_of_a_courtyard_is_seen_between_its_walls() -> None:
-    scene = scene_of(RoofShape.COURTYARD, 2)
-    outline = scene.buildings[0].footprint
-    assert len(outline.interiors) == 1
-    court = shapely.Polygon(outline.interiors[0])
-    x, y = np.random.default_rng(1).uniform(10, 70, (2, 20_000))
-    places = np.column_stack([x, y, scene.terrain.elevation(x, y)])
-    arrays = scene_arrays(scene, max_lean=LEAN)
-    inside = shapely.contains(court, shapely.points(x, y))
-    assert inside.sum() > 50
-    from_above = hits_of_lines(arrays, places, np.zeros((len(x), 2)))
-    assert (from_above.kind[inside] == GROUND).all()
-    aside = hits_of_lines(arrays, places, np.tile([0.4, 0.0], (len(x), 1)))
-    walls = aside.kind == WALL
-    near_court = shapely.distance(court.exterior, shapely.points(aside.xyz[:, :2])) < 1e-6
-    assert (walls & near_court).sum() > 30
-
-
 @settings(max_examples=examples(60), deadline=None)
 @given(
     slope_deg=st.floats(0.0, 30.0),
@@ -183,14 +149,6 @@ def test_lines_land_on_steep_waving_terrain(
     x, y, z = hits.xyz.T
     assert np.abs(terrain.elevation(x, y) - z).max() < 1e-5
     assert np.abs(hits.xyz[:, :2] - places[:, :2] - (z - 100.0)[:, None] * leans).max() < 1e-9
-
-
-def test_a_survey_of_a_30_degree_slope_measures_it() -> None:
-    terrain = Terrain(base_z_m=200.0, slope_x=math.tan(math.radians(30.0)))
-    block = scan_all(scene_on(terrain, 150), ScannerSettings(range_noise_m=0.0, drop_out=0.0, altitude_m=400.0), 1)
-    x, y, z = block.points.xyz.T
-    assert np.abs(terrain.elevation(x, y) - z).max() < 0.0015  # rounded to whole millimetres
-    assert len(block) == pytest.approx(8.0 * 150.0 * 150.0 * (1 + 18 / 150), rel=0.05)
 
 
 @pytest.mark.parametrize("shift_m", np.arange(0.0, 5.0, 0.5).tolist())

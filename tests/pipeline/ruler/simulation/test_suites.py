@@ -64,7 +64,7 @@ def test_the_same_seed_gives_the_same_scene_and_another_one_another(name: str) -
         assert corners(first) != corners(other)
 
 
-@pytest.mark.parametrize("name", ["hofmann310", "sweep", "city", "low_buildings"])
+@pytest.mark.parametrize("name", ["suburb", "town", "hofmann310", "sweep", "city", "low_buildings"])
 def test_buildings_have_names_of_their_own_and_never_overlap(name: str) -> None:
     scene = scene_of(name, 1003)
     assert len({one.building_id for one in scene.buildings}) == len(scene.buildings)

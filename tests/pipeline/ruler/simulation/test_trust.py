@@ -18,21 +18,22 @@ from pipeline.ruler.simulation.scene import Scene
 from pipeline.ruler.simulation.strips import Returns
 from pipeline.ruler.simulation.suites import SUITES
 from pipeline.ruler.simulation.survey_files import recorded
-from pipeline.ruler.simulation.trust import CELLS, KINDS, TrustCell, trust
+from pipeline.ruler.simulation.sweep import Cell
+from pipeline.ruler.simulation.trust import CELLS, KINDS, trust
 from pipeline.ruler.simulation.trust_trees import STANDS
 
 SEED = 1_000
 MOST_RETURNS = {Returns.FIVE: 5, Returns.FIRST_AND_LAST: 2, Returns.FIRST: 1, Returns.LAST: 1}
 
 
-def cell_of(kind: str, least_density: float = 0.0) -> TrustCell:
+def cell_of(kind: str, least_density: float = 0.0) -> Cell:
     return min(
         (cell for cell in CELLS if cell.kind == kind and cell.density_per_m2 >= least_density),
         key=lambda cell: cell.density_per_m2,
     )
 
 
-def scanned(scene: Scene, cell: TrustCell) -> ScanBlock:
+def scanned(scene: Scene, cell: Cell) -> ScanBlock:
     return scan_all(scene, cell.scanner(SUITES["trust"].scanner), SEED)
 
 
