@@ -1,4 +1,4 @@
-"""Which format a file has, by what it begins with and by its name; and which files of a folder are point files."""
+"""Which format a file has, by what it begins with and by its name."""
 
 from __future__ import annotations
 

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from pipeline.parameters import Parameters, parameter
 
+_GRID_M = 1e-3
+"""Resolution of the points: a distance to a plane is never less, even if settings and noise are 0."""
+
 
 class RegionGrowingSettings(Parameters):
     """Settings of region growing."""
@@ -153,7 +156,3 @@ class PlaneRefinementSettings(Parameters):
         """Distance of a point from its plane for a noise; at least 1 mm, the grid of the points."""
         bounded = min(max(self.noise_factor * sigma_m, self.min_plane_distance_m), self.max_plane_distance_m)
         return max(bounded, _GRID_M)
-
-
-_GRID_M = 1e-3
-"""Resolution of the points: a distance to a plane is never less, even if settings and noise are 0."""

@@ -27,12 +27,7 @@ from pipeline.export.records import SCHEMAS
 from pipeline.export.solid_geometry import SHAPE_COLUMNS
 from pipeline.extras.publish_3dtiles import globe_tileset
 from pipeline.extras.publish_3dtiles.globe import geodesy, to_globe
-from pipeline.extras.publish_3dtiles.property_table import (
-    BLOCK_COLUMNS,
-    COLUMNS,
-    StoredColumn,
-    stored_column,
-)
+from pipeline.extras.publish_3dtiles.property_table import BLOCK_COLUMNS, COLUMNS, StoredColumn, stored_column
 from pipeline.extras.publish_3dtiles.publishing_3dtiles import publish_3dtiles
 from pipeline.io.crs import SpatialReference
 from pipeline.model import BuildingResult

@@ -1,26 +1,21 @@
 """What a run does otherwise once it has many tiles: it joins by blocks, sorts rows by groups, makes larger tasks."""
 
-import itertools
 from collections import Counter
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 import pytest
 
 from pipeline.errors import RunError
 from pipeline.export.geoparquet import read_table
-from pipeline.export.records import KEYS
 from pipeline.ruler.simulation.dataset import simulate
-from pipeline.runtime.digest import Rows, merged, rows_of, run_digest
+from pipeline.runtime.digest import merged, rows_of, run_digest
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.resources import Resources
 from pipeline.runtime.run import RunSummary, run
 from pipeline.runtime.scratch import outcomes
-from pipeline.runtime.scratch.outcomes import InParts
 from pipeline.runtime.stages import content_digest, join, stored_sites
-from pipeline.runtime.stages.join import JoinBrief
 from pipeline.settings import RunSettings
 
 TILED: dict[str, Any] = {"tile_size_m": 30.0, "classes": "ignore"}
@@ -54,29 +49,6 @@ def test_a_run_joined_by_blocks_has_the_same_content(
     assert found.digest == of_one_block.digest
     assert found.counts == of_one_block.counts
     assert found.rejected == of_one_block.rejected
-
-
-def test_blocks_pass_on_little_and_the_last_join_finishes_it(quarter: Path, reconstruct: Any, monkeypatch: Any) -> None:
-    """Else the test above could not fail."""
-    joined: list[tuple[int, int]] = []
-    packed = outcomes._packed
-
-    def noted(brief: object, result: object) -> bytes:
-        if isinstance(result, InParts) and isinstance(result.brief, JoinBrief):
-            count = sum(len(sites.found.candidate_points_mm) for sites in result.parts[: len(result.brief.owned)])
-            joined.append((count, len(result.parts[-1].kind) if result.brief.passed_on else 0))
-        return packed(brief, result)
-
-    monkeypatch.setattr(outcomes, "_packed", noted)
-    monkeypatch.setattr(join, "_AT_ONCE", 4)
-    monkeypatch.setattr(join, "_TILES_ACROSS", 2)
-    reconstruct(quarter, settings=TILED)
-    *blocks, last = joined
-    assert len(blocks) > 5
-    assert sum(count for count, _ in blocks) > 0
-    assert sum(waiting for _, waiting in blocks) > 0
-    assert last[0] > 0
-    assert last[1] == 0
 
 
 def test_the_digest_of_many_tiles_is_that_of_their_tables(
@@ -113,32 +85,6 @@ def test_larger_tasks_give_the_same_content(
 def planes(of_one_block: RunSummary) -> pa.Table:
     """The planes of the run, of several buildings with several planes each."""
     return read_table(of_one_block.run_dir, "planes")
-
-
-def halves(table: pa.Table) -> list[Rows]:
-    """Every second row of a table, and the others."""
-    number = np.arange(table.num_rows)
-    return [rows_of(table.take(number[number % 2 == odd]), "planes") for odd in (0, 1)]
-
-
-def test_rows_of_parts_come_in_the_order_of_their_keys(planes: pa.Table) -> None:
-    whole = rows_of(planes, "planes")
-    together = merged("planes", halves(planes))
-    assert len(KEYS["planes"]) == len(whole.keys) == 2
-    assert np.array_equal(together.hashes, whole.hashes)
-    assert all(np.array_equal(a, b) for a, b in zip(together.keys, whole.keys, strict=True))
-    assert len(np.unique(whole.hashes, axis=0)) == planes.num_rows > 20
-
-
-def test_ranges_of_ids_follow_each_other_and_miss_no_row(planes: pa.Table) -> None:
-    whole = rows_of(planes, "planes")
-    letters = [letter.encode() for letter in content_digest._ALPHABET]
-    assert letters == sorted(letters)
-    assert tuple(KEYS) == content_digest.TABLES
-    edges = [b"", *letters[1:], None]
-    parts = [whole.between(low or b"", high) for low, high in itertools.pairwise(edges)]
-    assert np.array_equal(np.concatenate([part.hashes for part in parts]), whole.hashes)
-    assert sum(len(part.hashes) > 0 for part in parts) > 3
 
 
 def test_an_object_of_two_tiles_is_refused(planes: pa.Table) -> None:

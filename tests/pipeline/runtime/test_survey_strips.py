@@ -56,21 +56,29 @@ def test_houses_in_strips_that_disagree_are_found_and_the_strips_named(
     assert max(row["height_m"] for row in found) == pytest.approx(10.0, abs=0.25)
 
 
-def test_strips_that_fit_are_not_named_and_not_moved(tmp_path: Path, reconstruct: Any) -> None:
-    summary = reconstruct(two_strips(tmp_path / "tile.laz", 0.03))
+@pytest.mark.parametrize("survey", [two_strips, two_passes])
+def test_strips_that_fit_are_not_named_and_not_moved(survey: Any, tmp_path: Path, reconstruct: Any) -> None:
+    summary = reconstruct(survey(tmp_path / "tile.laz", 0.03))
     assert summary.statuses == {"ok": 3}
     assert warning_of(summary) == ""
     assert read_manifest(summary.run_dir).strip_moves_m == {}
 
 
-def test_inspect_names_the_strips(tmp_path: Path) -> None:
-    code, out, _ = invoke("inspect", str(two_strips(tmp_path / "tile.laz", 0.6)), "--json")
+@pytest.mark.parametrize(
+    ("survey", "said"),
+    [(two_strips, "strip 11 lies 0.60 m below strip 12"), (two_passes, "strip 0 at GPS time 230400 to")],
+)
+def test_inspect_names_the_strips(survey: Any, said: str, tmp_path: Path) -> None:
+    code, out, _ = invoke("inspect", str(survey(tmp_path / "tile.laz", 0.6)), "--json")
     assert code == 0
-    assert any("strip 11 lies 0.60 m below strip 12" in warning for warning in json.loads(out)["warnings"])
+    assert any(said in warning for warning in json.loads(out)["warnings"])
 
 
-def test_an_object_that_its_strips_keep_from_being_a_building_says_so(tmp_path: Path, reconstruct: Any) -> None:
-    summary = reconstruct(two_strips(tmp_path / "tile.laz", 0.8), settings={"strips": {"align_m": 10.0}})
+@pytest.mark.parametrize("survey", [two_strips, two_passes])
+def test_an_object_that_its_strips_keep_from_being_a_building_says_so(
+    survey: Any, tmp_path: Path, reconstruct: Any
+) -> None:
+    summary = reconstruct(survey(tmp_path / "tile.laz", 0.8), settings={"strips": {"align_m": 10.0}})
     said = [row for row in rows(summary.run_dir, "rejected") if row["reason"] == Reason.STRIPS_DISAGREE]
     assert said
     assert all(row["reason_detail"].startswith("strips lie 0.80 m apart, at most 0.1; vegetation: ") for row in said)
@@ -162,26 +170,6 @@ def test_strips_without_ids_in_files_of_their_own_are_found(tmp_path: Path, reco
     summary = reconstruct(*paths)
     assert summary.statuses == {"ok": 3}
     assert "lies 0.60 m below strip 0 at GPS time" in warning_of(summary)
-
-
-def test_passes_of_one_id_that_fit_are_not_named_and_change_nothing(tmp_path: Path, reconstruct: Any) -> None:
-    summary = reconstruct(two_passes(tmp_path / "tile.laz", 0.03))
-    assert summary.statuses == {"ok": 3}
-    assert warning_of(summary) == ""
-    assert read_manifest(summary.run_dir).strip_moves_m == {}
-
-
-def test_inspect_names_strips_by_gps_times(tmp_path: Path) -> None:
-    code, out, _ = invoke("inspect", str(two_passes(tmp_path / "tile.laz", 0.6)), "--json")
-    assert code == 0
-    assert any("strip 0 at GPS time 230400 to" in warning for warning in json.loads(out)["warnings"])
-
-
-def test_an_object_that_passes_of_one_id_keep_from_being_a_building_says_so(tmp_path: Path, reconstruct: Any) -> None:
-    summary = reconstruct(two_passes(tmp_path / "tile.laz", 0.8), settings={"strips": {"align_m": 10.0}})
-    said = [row for row in rows(summary.run_dir, "rejected") if row["reason"] == Reason.STRIPS_DISAGREE]
-    assert said
-    assert all(row["reason_detail"].startswith("strips lie 0.80 m apart, at most 0.1; vegetation: ") for row in said)
 
 
 @pytest.mark.parametrize("kind", ["random", "row", "milliseconds"])

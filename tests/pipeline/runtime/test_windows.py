@@ -16,7 +16,7 @@ from pipeline.runtime.plan import Plan, check_windows, make_plan, split_grid
 from pipeline.runtime.stages import split
 from pipeline.runtime.stages.split import Split, SplitTask, split_window
 from pipeline.settings import RunSettings
-from pipeline.terrain.settings import APRON_M, ClassesInUse, GroundSettings, SceneSettings
+from pipeline.terrain.settings import ClassesInUse, SceneSettings
 from pipeline.tiling import MM, Tile, TileGrid
 
 TRUSTED = ClassesInUse(ground=True, building=True)
@@ -95,28 +95,6 @@ def test_narrow_windows_give_the_content_of_one_that_sees_everything(
         grids.clear()
         assert reconstruct(classified, settings=settings | {"tile_size_m": size}, **request).digest == whole.digest
         assert {grid.halo_mm for grid in grids} == {math.ceil(support_m * MM)}
-
-
-def test_given_footprints_and_trusted_ground_shorten_what_is_seen() -> None:
-    settings = SceneSettings()
-    assert settings.split_support_m(footprints=True) == 0.0 < settings.split_support_m(footprints=False)
-    # terrain is needed wherever points are looked at, and on the apron around the core
-    for given in (False, True):
-        assert settings.terrain_m(footprints=given) >= settings.split_support_m(footprints=given)
-        assert settings.terrain_m(footprints=given) >= APRON_M
-    assert settings.support_m >= settings.outliers.support_m + settings.split_support_m(footprints=False)
-    # planes and the slope, cells and the middles of four of them
-    assert settings.ground.trusted_support_m >= settings.ground.reach_m + 3
-    assert settings.ground_support_m(TRUSTED) < settings.ground_support_m(ClassesInUse())
-    assert settings.ground_support_m(ClassesInUse(building=True)) == settings.ground_support_m(ClassesInUse())
-
-
-@pytest.mark.parametrize("filter_name", ["morphological", "hierarchical"])
-def test_trusted_ground_looks_as_far_as_terrain_is_drawn(filter_name: str) -> None:
-    near = GroundSettings(filter=filter_name)
-    far = GroundSettings(filter=filter_name, bridge_m=80)
-    assert far.trusted_support_m - near.trusted_support_m == far.reach_m - near.reach_m > 0
-    assert near.trusted_support_m < near.support_m
 
 
 @pytest.fixture

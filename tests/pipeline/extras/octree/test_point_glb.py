@@ -11,14 +11,7 @@ from points_glb import read_points_glb
 from pipeline.export.glb_arrays import MAX_STEP_MM
 from pipeline.extras.octree.building_points import building_points
 from pipeline.extras.octree.octree_tileset import TilesetNode, root_tileset
-from pipeline.extras.octree.point_glb import (
-    NO_BUILDING,
-    NO_PLANE,
-    NO_RESIDUAL,
-    ModelledPoints,
-    points_glb,
-    united,
-)
+from pipeline.extras.octree.point_glb import NO_BUILDING, NO_PLANE, NO_RESIDUAL, ModelledPoints, points_glb, united
 
 NAMES = ("ash", "birch", "cedar")
 
