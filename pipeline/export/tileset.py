@@ -37,3 +37,14 @@ def tileset_bytes(asset: Mapping[str, Any], error_m: float, refine: str, root: M
     """A tileset file; `refine` says whether children are shown beside their parents (ADD) or in their place."""
     document = {"asset": asset, "geometricError": error_m, "root": {"refine": refine, **root}, **more}
     return json.dumps(document, separators=(",", ":"), ensure_ascii=False, allow_nan=False).encode()
+
+
+def moved_tileset(content: bytes, folder: str) -> bytes:
+    """A tileset for another place, from which `folder` leads to its files."""
+    document = json.loads(content)
+    waiting = [document["root"]]
+    for node in waiting:
+        if "content" in node:
+            node["content"]["uri"] = f"{folder}/{node['content']['uri']}"
+        waiting.extend(node.get("children", ()))
+    return json.dumps(document, separators=(",", ":"), ensure_ascii=False).encode()

@@ -16,7 +16,7 @@ from pipeline.io.storage import LocalStorage
 from service.features.index import NAME as INDEX_NAME
 from service.features.index import RowIndex
 from service.outputs.catalogue import Catalogue, ResultsCrs, stored_outputs
-from service.outputs.files import write_moved_tileset, zip_files
+from service.outputs.files import zip_files
 from service.outputs.kinds import OUTPUTS, chosen
 
 if TYPE_CHECKING:
@@ -196,8 +196,10 @@ def _meshes(work: _Work, path: Path, _: str) -> None:
 
 
 def _tileset(work: _Work, path: Path, _: str) -> None:
+    from pipeline.export.tileset import moved_tileset
+
     # from jobs/ID/results/tileset to jobs/ID/points
-    write_moved_tileset(work.run_dir / POINTS_FOLDER / TILESET, path, "../points")
+    path.write_bytes(moved_tileset((work.run_dir / POINTS_FOLDER / TILESET).read_bytes(), "../points"))
 
 
 def _geojson(work: _Work, path: Path, _: str) -> None:

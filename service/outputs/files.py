@@ -1,12 +1,10 @@
-"""Files of outputs: zip files without times, and tilesets at another place."""
+"""Files of outputs: zip files without times."""
 
 from __future__ import annotations
 
-import json
 import shutil
 import zipfile
 from pathlib import Path
-from typing import Any
 
 _EPOCH = (1980, 1, 1, 0, 0, 0)
 _FILE_MODE = 0o100644 << 16
@@ -42,19 +40,3 @@ def _entry(name: str) -> zipfile.ZipInfo:
     entry.compress_type = zipfile.ZIP_STORED if name.endswith(".laz") else zipfile.ZIP_DEFLATED
     entry.external_attr = _FILE_MODE
     return entry
-
-
-def write_json(path: Path, document: Any) -> None:
-    """Write a JSON document without spaces."""
-    path.write_text(json.dumps(document, separators=(",", ":"), ensure_ascii=False), encoding="utf-8")
-
-
-def write_moved_tileset(source: Path, target: Path, place: str) -> None:
-    """Write a tileset for another place, from which `place` leads to that of its files."""
-    tileset = json.loads(source.read_bytes())
-    waiting = [tileset["root"]]
-    for node in waiting:
-        if "content" in node:
-            node["content"]["uri"] = f"{place}/{node['content']['uri']}"
-        waiting.extend(node.get("children", ()))
-    write_json(target, tileset)

@@ -78,7 +78,7 @@ FORMS: Mapping[str, Form] = {
             options=("geoid_height_m",),
             root="tileset.json",
             files=rf"(tileset|terrain)\.json|(models|blocks|terrain)/{_TILE}\.glb|skylines/{_TILE}_\d{{1,9}}\.glb",
-            moved="pipeline.extras.publish_3dtiles.globe_tileset:moved_tileset",
+            moved="pipeline.export.tileset:moved_tileset",
             outputs=(
                 Output(
                     output_id="3dtiles",

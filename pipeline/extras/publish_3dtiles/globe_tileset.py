@@ -9,7 +9,6 @@ content: where an inner node without content is far enough away not to be refine
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -145,14 +144,3 @@ def _entry(node: Node, parent: FloatArray) -> dict[str, Any]:
         uri=node.uri,
         children=[_entry(child, matrix) for child in node.children],
     )
-
-
-def moved_tileset(content: bytes, folder: str) -> bytes:
-    """A tileset for a place above its folder."""
-    document = json.loads(content)
-    waiting = [document["root"]]
-    for node in waiting:
-        if "content" in node:
-            node["content"]["uri"] = f"{folder}/{node['content']['uri']}"
-        waiting.extend(node.get("children", ()))
-    return json.dumps(document, separators=(",", ":"), ensure_ascii=False).encode()

@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 import small_buildings as small
 from command_line import invoke
-from pipeline.runtime.monitoring.events import Event
 from small_runs import content, moved, restated, street, tiled_run
 
 from pipeline.errors import RunError, SettingsError
@@ -18,6 +17,7 @@ from pipeline.io import storage_at
 from pipeline.registry import loaded
 from pipeline.runtime.digest import run_digest
 from pipeline.runtime.manifest import RunStatus
+from pipeline.runtime.monitoring.progress import Event
 
 Write = Callable[..., Any]
 FOLDERS = {"3dtiles", "cityjson", "stac"}
