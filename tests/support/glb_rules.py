@@ -82,6 +82,18 @@ def chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
     return document, data[start + 8 :]
 
 
+def values_of(document: dict[str, Any], binary: bytes, index: int) -> np.ndarray:
+    """The values (n, k) of an accessor with a view of its own; they have the bounds that it states."""
+    found = document["accessors"][index]
+    view = document["bufferViews"][found["bufferView"]]
+    kind, width = np.dtype(COMPONENTS[found["componentType"]]), WIDTHS[found["type"]]
+    stride = view.get("byteStride", kind.itemsize * width) // kind.itemsize
+    values = np.frombuffer(binary, kind, found["count"] * stride, view["byteOffset"]).reshape(-1, stride)[:, :width]
+    for name, bound in (("min", values.min(axis=0)), ("max", values.max(axis=0))):
+        assert name not in found or found[name] == bound.tolist()
+    return values
+
+
 def read_glb(data: bytes) -> Glb:
     """Read a file and hold it against the rules."""
     document, binary = chunks(data)

@@ -46,13 +46,6 @@ def test_a_name_with_a_unit_means_that_unit() -> None:
         assert (column.unit == VERTICAL) == bool(re.fullmatch(r"\w+_z|h_\w+", column.name)), column.name
 
 
-def test_one_name_means_one_type_in_all_tables() -> None:
-    kinds: dict[str, set[pa.DataType]] = {}
-    for column in ALL:
-        kinds.setdefault(column.name, set()).add(column.kind)
-    assert {name: found for name, found in kinds.items() if len(found) > 1} == {}
-
-
 @pytest.mark.parametrize("table", list(SCHEMAS))
 @settings(max_examples=examples(30), deadline=None)
 @given(data=st.data())

@@ -3,11 +3,9 @@
 import dataclasses
 import datetime as dt
 import shutil
-import time
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -22,7 +20,6 @@ from pipeline.errors import RunError
 from pipeline.export.geoparquet import read_table
 from pipeline.export.records import BUILDINGS, SCHEMAS, CandidateFacts
 from pipeline.export.tile import write_tile
-from pipeline.runtime import digest
 from pipeline.runtime.digest import ADDED, FIGURES_ONLY, NOT_CONTENT, canonical_rows, run_digest
 
 BUILT = (small.gable, small.courtyard, small.two_parts, small.failed, small.pent, small.levelled, small.overhung)
@@ -81,14 +78,6 @@ def test_tile_mesh_path_and_input_hash_are_no_content(
     write_tile(tmp_path, "t1", [build() for build in BUILT[:2]], [], other, "none")
     write_tile(tmp_path, "t2", [build() for build in BUILT[2:]], rejected_objects, other, "tile")
     assert run_digest(str(tmp_path)) == run_digest(str(run_dir))
-
-
-@pytest.mark.parametrize("column", ["ground_z", "volume_m3", "n_points", "valid", "validity_codes", "reason_detail"])
-def test_one_changed_value_changes_the_digest(run_dir: Path, tmp_path: Path, column: str) -> None:
-    changes = {"ground_z": 2.001, "volume_m3": 0.001, "n_points": 319, "valid": False, "validity_codes": [203]}
-    value = changes.get(column, "another 12")
-    other = rewritten(run_dir, tmp_path, "buildings", lambda table: with_value(table, column, 0, value))
-    assert run_digest(str(other)) != run_digest(str(run_dir))
 
 
 @pytest.mark.parametrize("name", sorted(set(BUILDINGS.names) - NOT_CONTENT))
@@ -183,12 +172,6 @@ def test_null_zero_and_nothing_are_three_things() -> None:
     assert len({row(a=pa.array([one], pa.list_(pa.int32())), b=pa.array([two])) for one, two in lists}) == 4
 
 
-def test_the_batch_size_does_not_count(run_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    before = run_digest(str(run_dir))
-    monkeypatch.setattr(digest, "ROWS_A_BATCH", 2)
-    assert run_digest(str(run_dir)) == before
-
-
 def test_one_object_in_two_files_is_an_error(run_dir: Path, tmp_path: Path, contexts: Contexts) -> None:
     shutil.copytree(run_dir, tmp_path, dirs_exist_ok=True)
     write_tile(tmp_path, "t2", [small.pent()], [], contexts["compound"])
@@ -199,16 +182,3 @@ def test_one_object_in_two_files_is_an_error(run_dir: Path, tmp_path: Path, cont
 def test_a_directory_without_a_run_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(RunError, match="buildings is not a folder"):
         run_digest(str(tmp_path))
-
-
-@pytest.mark.slow
-def test_a_hundred_thousand_rows_take_seconds(tmp_path: Path, run_dir: Path) -> None:
-    for name in SCHEMAS:
-        rows = read_table(str(run_dir), name).drop_columns("tile")
-        many = rows.take(np.zeros(100_000, np.int64))
-        ids = pa.array([f"{i:026d}" for i in range(100_000)])
-        (tmp_path / name / "tile=t").mkdir(parents=True)
-        pq.write_table(many.set_column(0, many.schema.field(0), ids), tmp_path / name / "tile=t" / "part-0.parquet")
-    start = time.perf_counter()
-    run_digest(str(tmp_path))
-    assert time.perf_counter() - start < 30.0

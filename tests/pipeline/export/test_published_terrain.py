@@ -10,7 +10,7 @@ import pyproj
 import pytest
 import small_buildings as small
 from cityjson_rules import faults
-from glb_rules import chunks
+from glb_rules import chunks, values_of
 from small_runs import content, moved, restated, street, tiled_run
 
 from pipeline.errors import RunError
@@ -59,21 +59,13 @@ def triangles_at(path: Path, matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray
     document, binary = chunks(path.read_bytes())
     (primitive,) = document["meshes"][0]["primitives"]
 
-    def values(index: int, kind: str, width: int) -> np.ndarray:
-        accessor = document["accessors"][index]
-        start = document["bufferViews"][accessor["bufferView"]]["byteOffset"]
-        found = np.frombuffer(binary, kind, accessor["count"] * width, start).reshape(-1, width)
-        for name, bound in (("min", found.min(axis=0)), ("max", found.max(axis=0))):
-            assert name not in accessor or accessor[name] == bound.tolist()
-        return found
-
     def turned(xyz: np.ndarray) -> np.ndarray:
         found: np.ndarray = np.column_stack((xyz[:, 0], -xyz[:, 2], xyz[:, 1])) @ matrix[:3, :3].T
         return found
 
-    vertices = turned(values(primitive["attributes"]["POSITION"], "<f4", 3).astype(float)) + matrix[:3, 3]
-    normals = turned(values(primitive["attributes"]["NORMAL"], "|i1", 4)[:, :3] / 127.0)
-    return vertices, normals, values(primitive["indices"], "<u2", 1).reshape(-1, 3)
+    positions, normals = (values_of(document, binary, primitive["attributes"][name]) for name in ("POSITION", "NORMAL"))
+    triangles = values_of(document, binary, primitive["indices"]).reshape(-1, 3)
+    return turned(positions.astype(float)) + matrix[:3, 3], turned(normals / 127.0), triangles
 
 
 def placed(out: Path) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]:

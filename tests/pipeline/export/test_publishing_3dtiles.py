@@ -16,7 +16,7 @@ import pytest
 import small_buildings as small
 from checkout import ROOT
 from command_line import invoke
-from glb_rules import chunks
+from glb_rules import chunks, values_of
 from small_runs import moved, reference_of, street, tiled_run
 
 from pipeline.errors import RunError
@@ -35,7 +35,6 @@ from pipeline.runtime.manifest import write_manifest
 from pipeline.runtime.manifest_reading import read_manifest
 from pipeline.tiling import Tile
 
-COMPONENTS = {5120: "<i1", 5121: "<u1", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 GEOID_M = 43.2
 PAGE = ROOT / "docs" / "how_to" / "3d_tiles.md"
 
@@ -118,17 +117,6 @@ def features_of(path: Path, matrix: np.ndarray) -> dict[str, Feature]:
     (node,) = document["nodes"]
     (mesh,) = document["meshes"]
 
-    def accessor(index: int) -> np.ndarray:
-        found = document["accessors"][index]
-        view = document["bufferViews"][found["bufferView"]]
-        kind = np.dtype(COMPONENTS[found["componentType"]])
-        width = {"SCALAR": 1, "VEC3": 3}[found["type"]]
-        stride = view.get("byteStride", kind.itemsize * width) // kind.itemsize
-        values = np.frombuffer(binary, kind, found["count"] * stride, view["byteOffset"]).reshape(-1, stride)[:, :width]
-        for name, bound in (("min", values.min(axis=0)), ("max", values.max(axis=0))):
-            assert name not in found or found[name] == bound.tolist()
-        return values
-
     rows = property_values(document, binary)
     assert len(rows) == len({row["building_id"] for row in rows})
     features = [Feature(row, {}, {}, {}) for row in rows]
@@ -136,13 +124,15 @@ def features_of(path: Path, matrix: np.ndarray) -> dict[str, Feature]:
         material = document["materials"][primitive["material"]]["name"]
         sets = primitive["extensions"]["EXT_mesh_features"]["featureIds"]
         assert (sets[0]["label"], sets[0]["featureCount"], sets[0]["propertyTable"]) == ("building", len(rows), 0)
-        local = accessor(primitive["attributes"]["POSITION"]) * node["scale"][0] + node["translation"]
+        local = (
+            values_of(document, binary, primitive["attributes"]["POSITION"]) * node["scale"][0] + node["translation"]
+        )
         up = np.column_stack((local[:, 0], -local[:, 2], local[:, 1]))
         places = up @ matrix[:3, :3].T + matrix[:3, 3]
-        shades = accessor(primitive["attributes"]["NORMAL"]) / 127.0
+        shades = values_of(document, binary, primitive["attributes"]["NORMAL"]) / 127.0
         shades = np.column_stack((shades[:, 0], -shades[:, 2], shades[:, 1])) @ matrix[:3, :3].T
-        numbers = accessor(primitive["attributes"][f"_FEATURE_ID_{sets[0]['attribute']}"])[:, 0]
-        triangles = accessor(primitive["indices"]).reshape(-1, 3)
+        numbers = values_of(document, binary, primitive["attributes"][f"_FEATURE_ID_{sets[0]['attribute']}"])[:, 0]
+        triangles = values_of(document, binary, primitive["indices"]).reshape(-1, 3)
         assert (numbers[triangles] == numbers[triangles[:, :1]]).all()
         for number, feature in enumerate(features):
             own = triangles[numbers[triangles[:, 0]] == number]
@@ -150,7 +140,7 @@ def features_of(path: Path, matrix: np.ndarray) -> dict[str, Feature]:
                 feature.triangles[material] = places[own]
                 feature.normals[material] = shades[own[:, 0]]
             if len(own) and len(sets) > 1:
-                held = accessor(primitive["attributes"][f"_FEATURE_ID_{sets[1]['attribute']}"])[:, 0]
+                held = values_of(document, binary, primitive["attributes"][f"_FEATURE_ID_{sets[1]['attribute']}"])[:, 0]
                 feature.planes[material] = set(held[own].ravel().tolist())
     return {feature.properties["building_id"]: feature for feature in features}
 

@@ -44,10 +44,6 @@ def test_what_is_put_can_be_got_listed_and_replaced(storage):
     assert storage.keys("nowhere") == []
 
 
-def test_an_empty_storage_has_no_names(storage):
-    assert storage.names() == storage.keys() == []
-
-
 def test_odd_names_stay_what_they_are(storage):
     key = "meshes/tile=x1_y2/Straße 5, [a] #1 100%.obj"
     storage.put(key, b"x")
@@ -151,21 +147,6 @@ def test_several_things_wait_for_the_disk_at_the_same_time(tmp_path, monkeypatch
     assert storage.keys() == ["a", "b", "c"]
 
 
-def test_what_has_no_name_yet_goes_with_an_error(tmp_path):
-    storage = LocalStorage(root=tmp_path)
-    storage.put("a", b"old")
-
-    def put_two() -> None:
-        with storage.several(lambda: None) as puts:
-            puts.put("a", b"new")
-            raise ValueError("out of paper")
-
-    with pytest.raises(ValueError, match="out of paper"):
-        put_two()
-    assert storage.get("a") == b"old"
-    assert storage.names() == ["a"]
-
-
 def test_what_the_check_raises_ends_several_puts(storage):
     left = [5]
 
@@ -217,14 +198,6 @@ def test_a_folder_that_cannot_be_made_is_reported(tmp_path):
     (tmp_path / "file").write_bytes(b"")
     with pytest.raises(RunError, match="cannot be made"):
         LocalStorage(root=tmp_path / "file").put("a/b", b"")
-
-
-def test_a_folder_is_written_beside_its_names(tmp_path):
-    storage = LocalStorage(root=tmp_path)
-    with storage.putting("a.bin") as path:
-        path.write_bytes(b"x")
-        assert path.parent == tmp_path
-        assert list(tmp_path.iterdir()) == [path]
 
 
 def test_the_digest_is_that_of_the_content(tmp_path):
