@@ -14,7 +14,8 @@ export function section(id: string, title: string, ...content: Child[]): HTMLEle
 
 /** A text as it was sent. */
 export function rawText(id: string, title: string, text: string): HTMLElement {
-  return section(id, title, el("pre", { class: "raw", tabindex: 0, role: "region", "aria-labelledby": id }, text));
+  const region = el("pre", { class: "raw", tabindex: 0, role: "region", "aria-labelledby": id }, text);
+  return el("section", {}, el("h2", { id }, title), region);
 }
 
 /** The way back to a list. */
