@@ -11,11 +11,11 @@ from pipeline.io import ReadOptions
 from pipeline.model import Candidate
 from pipeline.runtime.cluster.serial_executor import SerialExecutor
 from pipeline.runtime.monitoring.progress import Progress, ignore
-from pipeline.runtime.plan import make_plan
 from pipeline.runtime.run_context import RunContext
+from pipeline.runtime.run_plan import make_plan
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.stages.gather import gather
-from pipeline.runtime.stages.ground import find_ground
+from pipeline.runtime.stages.ground_stage import find_ground
 from pipeline.runtime.stages.join import join
 from pipeline.runtime.stages.read_inputs import read_inputs
 from pipeline.runtime.stages.sites import found_sites

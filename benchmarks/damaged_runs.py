@@ -20,8 +20,8 @@ from pathlib import Path
 from benchmarks.damage import damaged
 from benchmarks.undamaged_inputs import Kind, write_inputs
 from pipeline.console import ExitCode
+from pipeline.runtime.isolation.child_messages import Finished
 from pipeline.runtime.isolation.child_pool import ChildPool
-from pipeline.runtime.isolation.messages import Finished
 from pipeline.runtime.isolation.supervision import EndCause
 from pipeline.runtime.monitoring.progress import never
 
@@ -132,7 +132,7 @@ def faults_of(run_dir: Path) -> list[str]:
     """What is wrong with the results of a run: solids that are not valid, buildings that failed by our fault."""
     from pipeline.export.geoparquet import read_table
     from pipeline.quality.validity import check_solid
-    from pipeline.ruler.evaluation.reading.run import read_run
+    from pipeline.ruler.evaluation.reading.run_models import read_run
 
     if not run_dir.is_dir():  # a damaged batch file can name another folder
         return []
@@ -217,12 +217,12 @@ def load() -> None:
     import pyogrio  # noqa: F401
     import pyproj
 
-    import pipeline.batch.run
+    import pipeline.batch.batch_run
     import pipeline.cli
     import pipeline.extras.ply_ascii.ascii
     import pipeline.extras.ply_ascii.ply
     import pipeline.io.las
-    import pipeline.ruler.evaluation.reading.run  # noqa: F401
+    import pipeline.ruler.evaluation.reading.run_models  # noqa: F401
     from pipeline.runtime.isolation.fork_server import load_all
     from pipeline.runtime.isolation.preloading import loads_of
 

@@ -38,12 +38,13 @@ from pipeline.runtime.cluster.packed_tasks import pack_tasks
 from pipeline.runtime.cluster.serial_executor import SerialExecutor
 from pipeline.runtime.monitoring.measurement import Measured, Result, Task, peak_of_process
 from pipeline.runtime.monitoring.progress import Event, Watch, ignore
-from pipeline.runtime.plan import Plan, make_plan, tiles_per_block
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.resources import Resources
 from pipeline.runtime.run import RunSummary, run
+from pipeline.runtime.run_plan import Plan, make_plan, tiles_per_block
 from pipeline.runtime.scratch.outcomes import OutcomeTask, StoredOutcome
-from pipeline.runtime.stages import join, stored_sites, units
+from pipeline.runtime.stages import divided_units as units
+from pipeline.runtime.stages import join, stored_sites
 from pipeline.runtime.stages.join import JoinBrief
 from pipeline.settings import RunSettings
 from pipeline.tiling import MM, Tile

@@ -33,12 +33,12 @@ from pipeline.extras.compare.compare import Variant, run_variants, settings_of
 from pipeline.io.source import ReadOptions
 from pipeline.methods import METHODS
 from pipeline.ruler.evaluation.evaluate import Evaluation, evaluate
-from pipeline.ruler.evaluation.ground import GroundOfRun
+from pipeline.ruler.evaluation.evaluation_writing import write_tables
+from pipeline.ruler.evaluation.ground_scores import GroundOfRun
 from pipeline.ruler.evaluation.reading import read_models
 from pipeline.ruler.evaluation.reference import Reference
 from pipeline.ruler.evaluation.reference_points import read_points_reference
 from pipeline.ruler.evaluation.reference_truth import read_truth_reference
-from pipeline.ruler.evaluation.writing import write_tables
 from pipeline.ruler.simulation.dataset import simulate
 from pipeline.ruler.simulation.seeds import seed_of
 from pipeline.ruler.simulation.sweep import CELLS, Cell

@@ -28,7 +28,7 @@ from pipeline.scene import GROUND_CLASS
 from pipeline.terrain.ground import ground_of, ground_points
 from pipeline.terrain.lattice import CELL_MM
 from pipeline.terrain.outliers import dense_enough
-from pipeline.terrain.settings import GroundSettings, OutlierSettings
+from pipeline.terrain.terrain_settings import GroundSettings, OutlierSettings
 
 Ints = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]

@@ -18,8 +18,8 @@ from pipeline.export.geoparquet import read_table
 from pipeline.ruler.evaluation.models import RoofModel
 from pipeline.ruler.evaluation.reading import read_models
 from pipeline.ruler.evaluation.reference import Reference
-from pipeline.ruler.evaluation.residuals import RMSE, building_residuals
-from pipeline.ruler.evaluation.validity import validity
+from pipeline.ruler.evaluation.residual_scores import RMSE, building_residuals
+from pipeline.ruler.evaluation.validity_scores import validity
 
 LOD2 = "2.2"
 """The level of detail that counts as delivered."""

@@ -32,13 +32,13 @@ from pipeline.extras.classify.classify import ClassifyRequest, classify
 from pipeline.model import BoolArray, Status
 from pipeline.ruler.evaluation.evaluate import evaluate
 from pipeline.ruler.evaluation.reading import read_models
-from pipeline.ruler.evaluation.reading.wireframes import read_wireframes
+from pipeline.ruler.evaluation.reading.wireframe_files import read_wireframes
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.resources import SERIAL
 from pipeline.runtime.run import run
 from pipeline.scene import BUILDING_CLASS
 from pipeline.settings import RunSettings
-from pipeline.terrain.settings import GroundSettings
+from pipeline.terrain.terrain_settings import GroundSettings
 
 PARTS = ("ground", "classes", "forest", "wireframes")
 IGN_CRS = "EPSG:2154"

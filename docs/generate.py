@@ -27,8 +27,8 @@ from pipeline.model import Reason
 from pipeline.parameters import Parameters
 from pipeline.quality import validity as checker
 from pipeline.reasons import REASONS
-from pipeline.ruler.epochs import records as changes_of
-from pipeline.ruler.epochs.settings import DiffSettings
+from pipeline.ruler.epochs import change_records as changes_of
+from pipeline.ruler.epochs.epoch_settings import DiffSettings
 from pipeline.ruler.evaluation.chapters import TITLES
 from pipeline.ruler.evaluation.definitions import DEFINITIONS
 from pipeline.settings import SECTIONS, GeneralSettings

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from pipeline.report.render import render_run
 from pipeline.ruler.evaluation.evaluate import Evaluation
-from pipeline.ruler.evaluation.files import EvaluationRequest, evaluate_files
-from pipeline.ruler.evaluation.writing import write_tables
+from pipeline.ruler.evaluation.evaluate_files import EvaluationRequest, evaluate_files
+from pipeline.ruler.evaluation.evaluation_writing import write_tables
 from pipeline.ruler.report.evaluation_page import write_page
 from pipeline.ruler.simulation.dataset import Output, ScenePaths, simulate
 from pipeline.runtime.monitoring.progress import Event, Listener

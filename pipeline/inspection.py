@@ -16,15 +16,15 @@ from pipeline.runtime.engine import engine_of, workers_that_fit
 from pipeline.runtime.expected import expected
 from pipeline.runtime.forecast import Forecast, forecast
 from pipeline.runtime.monitoring.measurement import cores, memory_bytes
-from pipeline.runtime.plan import Plan, make_plan
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.resources import Resources
+from pipeline.runtime.run_plan import Plan, make_plan
 from pipeline.runtime.stages.ingested import without_roofs
 from pipeline.settings import RunSettings
 from pipeline.terrain.flight_passes import NO_SLICES, passes_of, slices_of, united_slices
-from pipeline.terrain.settings import StripSettings
 from pipeline.terrain.strip_moves import moves_of, offsets_of, strips_warning, surfaces_warning
 from pipeline.terrain.survey_strips import SQUARE_MM, compared_strips
+from pipeline.terrain.terrain_settings import StripSettings
 from pipeline.tiling import MM
 
 RAISED_M = 2.5

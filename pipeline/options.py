@@ -1,8 +1,8 @@
 """The options of a run, each described once: name, type, default, unit, range, meaning, and who takes it.
 
-Made from these classes: the options of commands (`pipeline.cli.options`), the keys of the batch file, the inputs of the
-service's processes and of its form, the options of its client, the fields of its page, and the names of all of these in
-messages. A new option is a field of one of the classes, and the place that reads it.
+Made from these classes: the options of commands (`cli/command_options.py`), the keys of the batch file, the inputs of
+the service's processes and of its form, the options of its client, the fields of its page, and their names in messages.
+A new option is a field of one of the classes, and the place that reads it.
 """
 
 from __future__ import annotations

@@ -20,8 +20,8 @@ from pipeline.terrain.lattice import CELL_MM, NO_DATA, height_above
 from pipeline.terrain.needed_ground import needed_vertices
 from pipeline.terrain.outliers import dense_enough
 from pipeline.terrain.point_assignment import Allowed, ScenePoints
-from pipeline.terrain.settings import ClassCodeSettings, ClassesInUse, SceneSettings
 from pipeline.terrain.surfaces import Fragments, fragments_of
+from pipeline.terrain.terrain_settings import ClassCodeSettings, ClassesInUse, SceneSettings
 from pipeline.terrain.thin_objects import are_thin
 from pipeline.terrain.thinning import highest_per_cell, lowest_below
 from pipeline.terrain.vegetation import crowns, planarity

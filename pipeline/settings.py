@@ -12,9 +12,15 @@ from pipeline.errors import SettingsError
 from pipeline.methods import METHODS, ReconstructSettings, method_named
 from pipeline.options import ChosenSettings
 from pipeline.parameters import Parameters, build, parameter, read_toml
-from pipeline.quality.settings import SupportSettings
-from pipeline.roof.settings import ArrangementSettings, FootprintSettings, GuideSettings, RoofSettings, RoofTypeSettings
-from pipeline.terrain.settings import (
+from pipeline.quality.support_settings import SupportSettings
+from pipeline.roof.roof_settings import (
+    ArrangementSettings,
+    FootprintSettings,
+    GuideSettings,
+    RoofSettings,
+    RoofTypeSettings,
+)
+from pipeline.terrain.terrain_settings import (
     CandidateSettings,
     ClassCodeSettings,
     GroundSettings,

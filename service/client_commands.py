@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pipeline.cli.options import AsJson, Quiet, SettingsFile, set_parameters, takes_options
+from pipeline.cli.command_options import AsJson, Quiet, SettingsFile, set_parameters, takes_options
 from pipeline.console import Console, ExitCode, exit_code_of
 from pipeline.errors import SettingsError
 from pipeline.extras.publish.publishing import FORMS

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pipeline.cli.options import AsJson, count_or_auto, takes_options
+from pipeline.cli.command_options import AsJson, count_or_auto, takes_options
 from pipeline.console import Console
 from pipeline.errors import RunError, SettingsError
 

@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from pipeline.batch.batch_file import Batch
-from pipeline.batch.keys import as_keys, errors_with_keys
+from pipeline.batch.batch_keys import as_keys, errors_with_keys
 from pipeline.batch.remaining_time import duration
 from pipeline.errors import EmptyInputError, InputError, RunError
 from pipeline.extras.footprints.given_footprints import footprints_of_run
@@ -27,10 +27,10 @@ from pipeline.runtime.expected import RATES, expected
 from pipeline.runtime.forecast import WORTH_S, forecast
 from pipeline.runtime.monitoring.measurement import cores, memory_bytes
 from pipeline.runtime.monitoring.progress import Progress, ignore
-from pipeline.runtime.plan import Plan, check_memory
 from pipeline.runtime.request import plan_inputs
 from pipeline.runtime.resources import Resources
 from pipeline.runtime.run_directory import check_out
+from pipeline.runtime.run_plan import Plan, check_memory
 from pipeline.runtime.scratch.folder import POINT
 from pipeline.runtime.scratch.work_folder import refuse_foreign
 from pipeline.tiling import MM

@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from pipeline.batch.remaining_time import duration
-from pipeline.cli.options import AsJson, Quiet
-from pipeline.cli.summary import show_summary
+from pipeline.cli.command_options import AsJson, Quiet
+from pipeline.cli.run_summary import show_summary
 from pipeline.console import Console, ExitCode
 
 if TYPE_CHECKING:
     from pipeline.batch.batch_file import Batch
+    from pipeline.batch.batch_status import Status
     from pipeline.batch.estimates import Estimate
-    from pipeline.batch.status import Status
 
 BatchFile = Annotated[str, typer.Argument(metavar="FILE", help="The batch file, TOML; docs/how_to/batch.md.")]
 _NEXT = 3
@@ -48,7 +48,7 @@ def run(file: BatchFile, as_json: AsJson = False, quiet: Quiet = False) -> None:
     """Run a batch; an interrupted one continues where it stopped, and unchanged parts are not computed again."""
     with Console(as_json=as_json, quiet=quiet) as console:
         from pipeline.batch.batch_file import read_batch
-        from pipeline.batch.run import compile_for_batch, run_batch
+        from pipeline.batch.batch_run import compile_for_batch, run_batch
 
         # SIGTERM, as systemd and Kubernetes send it, leaves a run that can continue
         signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -65,7 +65,7 @@ def status(file: BatchFile, as_json: AsJson = False) -> None:
     """Show the progress of a batch run, from any terminal, even after it died."""
     with Console(as_json=as_json) as console:
         from pipeline.batch.batch_file import read_batch
-        from pipeline.batch.status import NAME, read_status
+        from pipeline.batch.batch_status import NAME, read_status
 
         batch = read_batch(file)
         if batch.schedule.cron and not Path(batch.work_folder, NAME).exists():

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pipeline.cli.options import AsJson, Quiet, SettingsFile, takes_options
+from pipeline.cli.command_options import AsJson, Quiet, SettingsFile, takes_options
 from pipeline.console import Console
 from pipeline.runtime.isolation.preloading import is_surely_small, start_early
 

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-from pipeline.cli.options import takes_options
+from pipeline.cli.command_options import takes_options
 from pipeline.console import Console
 
 MetricsPort = Annotated[

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from pipeline.cli.options import AsJson, Quiet
+from pipeline.cli.command_options import AsJson, Quiet
 from pipeline.console import Console
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ def diff(
         from pipeline.io.places import made_here, place_below
         from pipeline.ruler.epochs.diff import DiffRequest, refuse_run_as_out
         from pipeline.ruler.epochs.diff import diff as compare_runs
-        from pipeline.ruler.epochs.settings import read_settings
+        from pipeline.ruler.epochs.epoch_settings import read_settings
         from pipeline.ruler.report.epochs_map import epochs_map, gathering
         from pipeline.ruler.report.epochs_page import write_page
         from pipeline.runtime.monitoring.progress import Event
@@ -85,7 +85,7 @@ def diff(
 
 def _show(console: Console, found: Diff) -> None:
     """The sums as tables, and the warnings."""
-    from pipeline.ruler.epochs.records import INCOMPARABLE
+    from pipeline.ruler.epochs.change_records import INCOMPARABLE
 
     for warning in found.warnings:
         console.warn(warning)

@@ -7,8 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
-from pipeline.cli.options import AsJson, Overwrite, Quiet, SettingsFile, takes_options
-from pipeline.cli.summary import show_summary
+from pipeline.cli.command_options import AsJson, Overwrite, Quiet, SettingsFile, takes_options
+from pipeline.cli.run_summary import show_summary
 from pipeline.console import Console, ExitCode
 from pipeline.runtime.isolation.preloading import start_early
 

@@ -7,9 +7,9 @@ from typing import Annotated
 
 import typer
 
-from pipeline.cli.options import AsJson, Quiet
+from pipeline.cli.command_options import AsJson, Quiet
 from pipeline.console import Console
-from pipeline.extras.party_walls.settings import PartyWallSettings
+from pipeline.extras.party_walls.party_wall_settings import PartyWallSettings
 
 _DEFAULTS = PartyWallSettings()
 

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from pipeline.cli.options import AsJson, Quiet, takes_options
+from pipeline.cli.command_options import AsJson, Quiet, takes_options
 from pipeline.console import Console, ExitCode
 from pipeline.runtime.isolation.preloading import start_early
 
@@ -63,8 +63,8 @@ def replay(
         from pipeline import __version__
         from pipeline.io.places import on_this_machine
         from pipeline.runtime.isolation.replay_bundle import read_bundle
-        from pipeline.runtime.replay import replay as replay_building
-        from pipeline.runtime.replay import replay_row, write_replay
+        from pipeline.runtime.replay_building import replay as replay_building
+        from pipeline.runtime.replay_building import replay_row, write_replay
         from pipeline.runtime.resources import resources_of
 
         limits = resources_of(given).isolation

@@ -8,8 +8,8 @@ from typing import Annotated, Any
 
 import typer
 
-from pipeline.cli.options import AsJson, Overwrite, Quiet, takes_options
-from pipeline.cli.summary import show_summary
+from pipeline.cli.command_options import AsJson, Overwrite, Quiet, takes_options
+from pipeline.cli.run_summary import show_summary
 from pipeline.console import Console
 
 
@@ -89,7 +89,7 @@ def demo(
     with Console(as_json=as_json, quiet=quiet) as console:
         from pipeline.demo import demonstrate
         from pipeline.ruler.evaluation.chapters import chapters
-        from pipeline.ruler.evaluation.writing import measures_table
+        from pipeline.ruler.evaluation.evaluation_writing import measures_table
         from pipeline.ruler.report.evaluation_page import headline
         from pipeline.runtime.compiling import RECONSTRUCT, compile_first
         from pipeline.runtime.isolation.preloading import start_early

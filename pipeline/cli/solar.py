@@ -7,9 +7,9 @@ from typing import Annotated
 
 import typer
 
-from pipeline.cli.options import AsJson, Quiet
+from pipeline.cli.command_options import AsJson, Quiet
 from pipeline.console import Console
-from pipeline.extras.solar.settings import SolarSettings
+from pipeline.extras.solar.solar_settings import SolarSettings
 
 _DEFAULTS = SolarSettings()
 

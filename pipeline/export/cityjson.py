@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.export.coordinates import SpatialReference, crs_coordinates, decimals, epsg_code
 from pipeline.export.obj import part_id
 from pipeline.export.solid_geometry import SHAPE_COLUMNS, SURFACES, models_beside
+from pipeline.export.stored_coordinates import SpatialReference, crs_coordinates, decimals, epsg_code
 from pipeline.model import BuildingResult, FaceKind, FloatArray, Plane, Solid
 
 VERSION = "2.0"

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 
 from shapely import MultiPolygon, Polygon
 
-from pipeline.export.coordinates import SpatialReference
+from pipeline.export.stored_coordinates import SpatialReference
 from pipeline.model import Reason
 
 

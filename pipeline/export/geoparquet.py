@@ -20,7 +20,7 @@ import shapely
 from pipeline.errors import RunError
 from pipeline.export.decisions import DECISIONS
 from pipeline.export.decisions import NAME as DECISIONS_NAME
-from pipeline.export.records import KEYS, SCHEMAS
+from pipeline.export.record_rows import KEYS, SCHEMAS
 from pipeline.export.solid_geometry import SOLIDS, WALL_OUTLINE
 
 if TYPE_CHECKING:
@@ -96,7 +96,7 @@ def _column_metadata(geometries: Any, projjson: Mapping[str, Any] | None) -> dic
 
 
 def geo_table(table_name: str, rows: Sequence[Mapping[str, Any]], projjson: Mapping[str, Any] | None) -> pa.Table:
-    """Rows of `pipeline.export.records` as an Arrow table with GeoParquet metadata, sorted by the table's key.
+    """Rows of `pipeline.export.record_rows` as an Arrow table with GeoParquet metadata, sorted by the table's key.
 
     `projjson` is the CRS of the geometries; None if it is unknown.
     """

@@ -22,7 +22,7 @@ from pipeline.compiler import kernel
 from pipeline.export.glb_arrays import bounds_of, gltf_axes, values_of
 from pipeline.export.glb_container import INDICES, VERTICES, GlbFile
 from pipeline.model import FloatArray, IntArray
-from pipeline.triangulation.faces import DONE, area_vector, triangulate_rings
+from pipeline.triangulation.face_triangles import DONE, area_vector, triangulate_rings
 
 MATERIALS: Mapping[str, tuple[float, float, float]] = {
     "RoofSurface": (0.50, 0.09, 0.06),

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from pipeline.export.coordinates import SpatialReference, crs_coordinates, decimals
 from pipeline.export.solid_geometry import model_at
+from pipeline.export.stored_coordinates import SpatialReference, crs_coordinates, decimals
 from pipeline.model import BuildingResult, FaceKind, FloatArray, Solid, SolidFace
 from pipeline.triangulation import triangulate_face
 

@@ -11,7 +11,7 @@ import struct
 from collections.abc import Sequence
 from typing import Any
 
-from pipeline.export.coordinates import SpatialReference, crs_coordinates
+from pipeline.export.stored_coordinates import SpatialReference, crs_coordinates
 from pipeline.model import BuildingResult, FaceKind, LodModel, Solid
 
 OVERHANGS = "2.3"

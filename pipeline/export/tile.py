@@ -12,14 +12,14 @@ import pyarrow as pa
 
 from pipeline.errors import RunError
 from pipeline.export.cityjson import cityjson_lines
-from pipeline.export.coordinates import one_unit
 from pipeline.export.decisions import decision_rows, decisions_path, decisions_table
 from pipeline.export.facts import RecordContext, RejectedObject
 from pipeline.export.folders import Put, put_local
 from pipeline.export.geoparquet import geo_table, parquet_bytes
 from pipeline.export.obj import obj_text
-from pipeline.export.records import building_row, plane_rows, rejected_row
+from pipeline.export.record_rows import building_row, plane_rows, rejected_row
 from pipeline.export.solid_geometry import lod_suffix, model_at
+from pipeline.export.stored_coordinates import one_unit
 from pipeline.model import BuildingResult
 from pipeline.options import MESHES
 

@@ -13,12 +13,12 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.errors import UnreadableInputError
-from pipeline.io.records import Readable
+from pipeline.io.file_facts import Readable
 
 if TYPE_CHECKING:
     from laspy.copc import CopcInfoVlr
 
-    from pipeline.io.records import Window
+    from pipeline.io.file_facts import Window
 
 ENTRY = np.dtype(
     [("level", "<i4"), ("x", "<i4"), ("y", "<i4"), ("z", "<i4"), ("offset", "<u8"), ("size", "<i4"), ("count", "<i4")]

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from pipeline.errors import EmptyInputError, UnreadableInputError
+from pipeline.io.file_facts import Readable
 from pipeline.io.locations import is_url
-from pipeline.io.records import Readable
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

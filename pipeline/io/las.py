@@ -21,6 +21,7 @@ from laspy.point.record import PackedPointRecord
 
 from pipeline.errors import InconsistentInputError, UnreadableInputError
 from pipeline.io.apart import apart
+from pipeline.io.file_facts import UNSORTED_CLASSES, FileFacts, PointRecords, Readable, Share, Window, bytes_of
 from pipeline.io.gps_time import GpsTimeKind, kind_of
 from pipeline.io.las_header import REWRITE, header_crs, read_header_block
 from pipeline.io.laz_chunks import (
@@ -34,7 +35,6 @@ from pipeline.io.laz_chunks import (
     read_chunk_table,
 )
 from pipeline.io.reading import moved
-from pipeline.io.records import UNSORTED_CLASSES, FileFacts, PointRecords, Readable, Share, Window, bytes_of
 from pipeline.io.strays import Bounds, header_box_problem, typical_bounds
 from pipeline.model import FloatArray
 

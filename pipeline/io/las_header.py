@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, BinaryIO, NamedTuple
 
 from pipeline.errors import EmptyInputError, InconsistentInputError, UnreadableInputError
-from pipeline.io.records import Readable
+from pipeline.io.file_facts import Readable
 
 if TYPE_CHECKING:
     import laspy

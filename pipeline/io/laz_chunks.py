@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.errors import InconsistentInputError, UnreadableInputError
+from pipeline.io.file_facts import Readable
 from pipeline.io.reading import moved
-from pipeline.io.records import Readable
 
 if TYPE_CHECKING:
     from pipeline.io.las_header import HeaderBlock

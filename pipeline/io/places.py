@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pipeline.io.file_facts import Readable
 from pipeline.io.locations import is_url
-from pipeline.io.records import Readable
 from pipeline.io.storage import LocalStorage, Storage
 from pipeline.registry import extra
 

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TypeVar
 
 from pipeline.errors import UnreadableInputError
+from pipeline.io.file_facts import Readable
 from pipeline.io.formats import ASCII, POINT_SUFFIXES, VALID, first_bytes, looks_like_points
-from pipeline.io.records import Readable
 
 File = TypeVar("File", bound=Readable)
 

@@ -16,11 +16,20 @@ from pipeline.errors import CrsError, InconsistentInputError, SettingsError
 from pipeline.io.area_of_use import Location, location_of
 from pipeline.io.crs import SpatialReference
 from pipeline.io.crs_resolution import resolve_reference
+from pipeline.io.file_facts import (
+    DivisibleFile,
+    FileFacts,
+    FileStatus,
+    PointFile,
+    PointRecords,
+    Readable,
+    Share,
+    Window,
+)
 from pipeline.io.formats import DIVISIBLE, PointFormat, recognise_format
 from pipeline.io.gps_time import GpsTimeKind, utc_of
 from pipeline.io.places import file_at
 from pipeline.io.reading import one_input
-from pipeline.io.records import DivisibleFile, FileFacts, FileStatus, PointFile, PointRecords, Readable, Share, Window
 from pipeline.io.strays import MOST_STRAYS, ROUNDING, off_earth, without_strays
 from pipeline.model import BoolArray, ByteArray, FloatArray, PointCloud
 from pipeline.registry import loaded

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import SettingsError
 from pipeline.parameters import Parameters
-from pipeline.quality.settings import SupportSettings
+from pipeline.quality.support_settings import SupportSettings
 from pipeline.registry import loaded
-from pipeline.roof.settings import ArrangementSettings, GuideSettings, RoofSettings, RoofTypeSettings
+from pipeline.roof.roof_settings import ArrangementSettings, GuideSettings, RoofSettings, RoofTypeSettings
 
 if TYPE_CHECKING:
     from pipeline.model import PreparedCloud, Segmentation
@@ -79,18 +79,18 @@ METHODS: Mapping[str, Method] = {
             "pipeline.segmentation.plane_settings:AdaptivePlaneSettings",
             follows_paper=False,
         ),
-        Method("fuzzy-sart", f"{_PAPERS}fuzzy_sart:segment", f"{_PAPERS}settings:FuzzySartSettings"),
+        Method("fuzzy-sart", f"{_PAPERS}fuzzy_sart:segment", f"{_PAPERS}paper_settings:FuzzySartSettings"),
         Method(
             "parameter-space-2d",
             f"{_PAPERS}parameter_space:segment_2d",
-            f"{_PAPERS}settings:ParameterSpace2dSettings",
+            f"{_PAPERS}paper_settings:ParameterSpace2dSettings",
         ),
         Method(
             "parameter-space-3d",
             f"{_PAPERS}parameter_space:segment_3d",
-            f"{_PAPERS}settings:ParameterSpace3dSettings",
+            f"{_PAPERS}paper_settings:ParameterSpace3dSettings",
         ),
-        Method("kmeans", f"{_PAPERS}kmeans:segment", f"{_PAPERS}settings:KMeansSettings"),
+        Method("kmeans", f"{_PAPERS}kmeans:segment", f"{_PAPERS}paper_settings:KMeansSettings"),
     )
 }
 """All methods by name. A recipe and its kernels load when a building is first segmented by it."""

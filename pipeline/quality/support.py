@@ -13,7 +13,7 @@ from pipeline.quality.roof_returns import TOLERANCE_M
 from pipeline.quality.unseen_sides import level_side_share, unseen_beside_m2, unseen_left_out_m2
 
 if TYPE_CHECKING:
-    from pipeline.quality.settings import SupportSettings
+    from pipeline.quality.support_settings import SupportSettings
 
 NOT_OF_FORM = frozenset({Reason.NOT_SEEN, Reason.UNCERTAIN})
 """Doubts that no other form of the roof would answer."""

@@ -49,7 +49,7 @@ from pipeline.quality.planarity import bends_where_it_is_straight, fitted_plane,
 from pipeline.quality.rings import RING_SELF_INTERSECTION, polygon_code
 from pipeline.quality.self_intersection import shell_intersects_itself
 from pipeline.quality.shell import is_sound_shell, six_volumes
-from pipeline.triangulation.faces import (
+from pipeline.triangulation.face_triangles import (
     DONE,
     MILLIMETRES_PER_METRE,
     area_vector,

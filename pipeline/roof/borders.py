@@ -19,7 +19,7 @@ import shapely
 from pipeline.model import Plane
 from pipeline.roof.lines import Point, Run, corners, crossing, dominant_direction, fitted_run, merge, split, square
 from pipeline.roof.partition import RoofPartition
-from pipeline.roof.settings import RoofSettings
+from pipeline.roof.roof_settings import RoofSettings
 from pipeline.roof.snapped_rings import differ_by_more
 
 _ROUNDS = 4

@@ -20,7 +20,7 @@ from pipeline.model import FloatArray
 from pipeline.roof.edge_position import EdgePoints, mixed_pulse_reach_mm, outward_shift_mm
 from pipeline.roof.footprint import polygons_of
 from pipeline.roof.lines import Point, Run, corners, merge, split
-from pipeline.roof.settings import RoofSettings
+from pipeline.roof.roof_settings import RoofSettings
 from pipeline.roof.snapped_rings import differ_by_more, on_grid, snapped_ring
 
 _FACTORS = (1.0, 0.6, 0.35)

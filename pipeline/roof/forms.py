@@ -18,7 +18,7 @@ from pipeline.registry import extra
 from pipeline.roof.named_form import ARRANGEMENT, MOST_TEMPLATE_POINTS, SIMPLER, TEMPLATES, NamedForm, RankedFaces
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.plan import RoofPoints, arranged_faces, drawn_outline, partition_roof
-from pipeline.roof.settings import ArrangementSettings, RoofSettings
+from pipeline.roof.roof_settings import ArrangementSettings, RoofSettings
 
 FaceForm = NamedForm[RoofPartition | RankedFaces]
 """Draws roof faces, over the planes of the segmentation or over planes of their own."""

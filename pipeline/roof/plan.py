@@ -35,7 +35,7 @@ from pipeline.roof.edge_position import EdgePoints, mixed_pulse_reach_mm
 from pipeline.roof.footprint import outline
 from pipeline.roof.labelling import continue_crossings, empty_samples, fill_labels
 from pipeline.roof.partition import OUTSIDE, MinAreas, RoofPartition, absorb_small_regions, march
-from pipeline.roof.settings import ArrangementSettings, RoofSettings
+from pipeline.roof.roof_settings import ArrangementSettings, RoofSettings
 from pipeline.tin.delaunay import triangulate
 
 if TYPE_CHECKING:

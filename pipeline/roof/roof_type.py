@@ -13,7 +13,7 @@ import math
 from collections.abc import Sequence
 
 from pipeline.model import FaceKind, Plane, RoofFace, RoofType, Solid, SolidFace
-from pipeline.roof.settings import RoofTypeSettings
+from pipeline.roof.roof_settings import RoofTypeSettings
 
 
 @dataclasses.dataclass

@@ -18,7 +18,7 @@ from pipeline.roof.footprint_in_mm import simpler_outlines
 from pipeline.roof.named_form import SIMPLER, TRACED, NamedForm
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.plan import RoofPlan, RoofPoints, min_face_area
-from pipeline.roof.settings import RoofSettings
+from pipeline.roof.roof_settings import RoofSettings
 from pipeline.roof.simplification import simplify_partition, unite_close_vertices
 
 

@@ -18,7 +18,7 @@ from pipeline.model import Candidate, LabelArray, Plane
 from pipeline.prepared_cloud import prepare_cloud
 from pipeline.roof.footprint import polygons_of
 from pipeline.roof.plan import partition_roof, roof_points
-from pipeline.roof.settings import RoofSettings
+from pipeline.roof.roof_settings import RoofSettings
 from pipeline.roof.traced_forms import FORMS, draw_clipped
 
 

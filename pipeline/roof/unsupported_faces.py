@@ -18,7 +18,7 @@ from pipeline.compiler import kernel
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray, Plane
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.plan import RoofPoints
-from pipeline.roof.settings import RoofSettings
+from pipeline.roof.roof_settings import RoofSettings
 
 REACH_SPACINGS = 2.0
 """A ridge, or an outline, lies no farther than this from the points of a slope that was seen up to there."""

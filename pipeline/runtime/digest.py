@@ -25,7 +25,7 @@ import pyarrow.fs as pafs
 
 from pipeline.errors import RunError
 from pipeline.export.geoparquet import stored_schema, table_batches
-from pipeline.export.records import KEYS
+from pipeline.export.record_rows import KEYS
 from pipeline.export.solid_geometry import OVERHANG_COLUMNS
 from pipeline.io import arrow_at
 

@@ -11,7 +11,7 @@ import dataclasses
 import math
 from collections.abc import Iterable, Mapping
 
-from pipeline.runtime.plan import Plan, shares_of, tiles_per_block, wanted_bounds_m, wanted_points
+from pipeline.runtime.run_plan import Plan, shares_of, tiles_per_block, wanted_bounds_m, wanted_points
 from pipeline.tiling import MM, Tile, TileGrid, Window
 
 _GROUND_REACH_M = 205.0

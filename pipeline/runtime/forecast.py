@@ -9,8 +9,8 @@ from pipeline.runtime.compiling import compiling_s, kernel_groups
 from pipeline.runtime.engine import Engine
 from pipeline.runtime.expected import RATES, Expected, expected
 from pipeline.runtime.monitoring.measurement import cores
-from pipeline.runtime.plan import Plan
 from pipeline.runtime.request import RunRequest
+from pipeline.runtime.run_plan import Plan
 
 WORTH_S = 3.0
 """Runs that take less wall time by the rates are not sampled: the sample would take a good part of their time."""

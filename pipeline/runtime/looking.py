@@ -15,8 +15,8 @@ from pipeline.io import ReadOptions, SourceInfo, is_url
 from pipeline.io.reading import set_input_timeout
 from pipeline.runtime.cluster.serial_executor import Executor
 from pipeline.runtime.monitoring.progress import Watch
-from pipeline.runtime.plan import MANY_FILES, looked_at, usable
 from pipeline.runtime.resources import Resources
+from pipeline.runtime.run_plan import MANY_FILES, looked_at, usable
 
 _FILES_PER_TASK = 32
 

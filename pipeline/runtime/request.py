@@ -18,8 +18,8 @@ from pipeline.registry import extra
 from pipeline.runtime.cluster.serial_executor import Executor
 from pipeline.runtime.manifest import InputFile
 from pipeline.runtime.monitoring.progress import Progress, Watch, never
-from pipeline.runtime.plan import MANY_FILES, Plan, check_places, looked_at, make_plan, without_far_files
 from pipeline.runtime.resources import Resources
+from pipeline.runtime.run_plan import MANY_FILES, Plan, check_places, looked_at, make_plan, without_far_files
 from pipeline.runtime.scratch.location import SCRATCH
 from pipeline.settings import RunSettings
 

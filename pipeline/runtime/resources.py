@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import SettingsError
 from pipeline.options import ResourceOptions, values_of
-from pipeline.runtime.isolation.limits import IsolationLimits
+from pipeline.runtime.isolation.process_limits import IsolationLimits
 
 if TYPE_CHECKING:
     from pipeline.runtime.cluster.priorities import Traffic

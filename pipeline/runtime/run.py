@@ -19,17 +19,17 @@ from pipeline.runtime.isolation.preloading import loads_of
 from pipeline.runtime.manifest import RunStatus
 from pipeline.runtime.monitoring.measurement import peak_of_process
 from pipeline.runtime.monitoring.progress import Listener, Progress, ignore, never
-from pipeline.runtime.plan import Plan
 from pipeline.runtime.request import RunRequest, plan_inputs
 from pipeline.runtime.run_context import RunContext, run_context
 from pipeline.runtime.run_directory import RunDirectory, about_emptiness, input_files, run_counts
+from pipeline.runtime.run_plan import Plan
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.location import check_scratch, run_scratch
 from pipeline.runtime.scratch.outcomes import Place
 from pipeline.runtime.stages.cleanup import tidy
 from pipeline.runtime.stages.content_digest import STAGE as DIGEST
 from pipeline.runtime.stages.content_digest import content_digest
-from pipeline.runtime.stages.ground import Ground, find_ground
+from pipeline.runtime.stages.ground_stage import Ground, find_ground
 from pipeline.runtime.stages.ingested import Ingested
 from pipeline.runtime.stages.join import join
 from pipeline.runtime.stages.publish import Published, RunOutput, publish

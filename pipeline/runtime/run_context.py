@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 
 from pipeline.errors import FolderLostError, RunOverError
 from pipeline.runtime.cluster.serial_executor import Executor, SerialExecutor
-from pipeline.runtime.isolation.limits import IsolationLimits
+from pipeline.runtime.isolation.process_limits import IsolationLimits
 from pipeline.runtime.monitoring.logs import about
 from pipeline.runtime.monitoring.measurement import Part
 from pipeline.runtime.monitoring.progress import TICK_S, Progress, Watch, never, span
-from pipeline.runtime.plan import Plan, check_memory
 from pipeline.runtime.resources import Resources
+from pipeline.runtime.run_plan import Plan, check_memory
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.outcomes import FOLDER as OUTCOMES
 from pipeline.runtime.scratch.outcomes import Files, OutcomeTask, Place, brief_of, run_and_store

@@ -14,19 +14,19 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline import __version__
 from pipeline.errors import RunCancelledError, RunError
-from pipeline.export.coordinates import one_unit
 from pipeline.export.folders import POINTS_FOLDER, TERRAIN_FOLDER
+from pipeline.export.stored_coordinates import one_unit
 from pipeline.io import SourceInfo, SpatialReference, Storage, shown, storage_at
 from pipeline.io.source import CAUSES
 from pipeline.model import Status
 from pipeline.runtime.manifest import NAME, PAGE, InputFile, PointFileFacts, RunManifest, RunStatus, write_manifest
 from pipeline.runtime.monitoring.progress import Progress
-from pipeline.runtime.plan import Plan
 from pipeline.runtime.request import RunRequest, input_file, request_record
+from pipeline.runtime.run_plan import Plan
 from pipeline.runtime.scratch.folder_lock import locked_results
 from pipeline.runtime.stages.batch_figures import Counted
 from pipeline.runtime.stages.cleanup import publishing
-from pipeline.runtime.stages.ground import Ground
+from pipeline.runtime.stages.ground_stage import Ground
 from pipeline.runtime.stages.ingested import Ingested, without_roofs
 from pipeline.runtime.stages.reconstruct import QUARANTINE
 from pipeline.runtime.stages.sites import Joined

@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from pipeline.errors import GableworkError, RunError
 from pipeline.io import ReadOptions, Source, SourceInfo, SpatialReference, is_url, open_source, shown
-from pipeline.io.records import Share
+from pipeline.io.file_facts import Share
 from pipeline.io.temporary import temporary_folder
 from pipeline.model import PointCloud
 from pipeline.runtime.cluster.local_executor import LocalExecutor
@@ -30,11 +30,11 @@ from pipeline.runtime.expected import RATES, Expected, around_km2, block_km2, fi
 from pipeline.runtime.isolation.child_pool import preload
 from pipeline.runtime.isolation.preloading import loads_of
 from pipeline.runtime.monitoring.progress import Watch, ignore
-from pipeline.runtime.plan import Plan, wanted_bounds_m
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.resources import SERIAL
 from pipeline.runtime.run import run
-from pipeline.terrain.settings import ClassCodeSettings
+from pipeline.runtime.run_plan import Plan, wanted_bounds_m
+from pipeline.terrain.terrain_settings import ClassCodeSettings
 from pipeline.tiling import MM, TileGrid
 
 # Constants of the estimate, measured; they decide nothing in a run, so they are not settings.

@@ -20,7 +20,7 @@ from pipeline.kernels.sorting import in_order
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
 from pipeline.segmentation.plane_regression import best_fit_plane, cluster_sums, cosine_of_slope, mean_square_residual
 from pipeline.segmentation.plane_settings import MIN_PLANE_POINTS, AdaptivePlaneSettings
-from pipeline.segmentation.point_assignment import (
+from pipeline.segmentation.point_votes import (
     dissolve_redundant,
     distance_to_plane,
     touching_pairs,

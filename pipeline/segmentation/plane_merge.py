@@ -17,7 +17,7 @@ from pipeline.kernels.heap import heap_pop, heap_push, heap_with_room
 from pipeline.kernels.sorting import ascending_order
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
 from pipeline.segmentation.plane_regression import best_fit_plane, cosine_of_slope, mean_square_residual
-from pipeline.segmentation.point_assignment import ascending_once
+from pipeline.segmentation.point_votes import ascending_once
 
 _NO_MERGE = 1e30  # a cost above every real one
 

@@ -17,7 +17,7 @@ from pipeline.errors import BuildingError
 from pipeline.model import BoolArray, FloatArray, LabelArray, Reason
 from pipeline.segmentation.plane_merge import merge_planes, parallel_pairs_in_reach
 from pipeline.segmentation.plane_regression import best_fit_plane, cluster_sums, cosine_of_slope
-from pipeline.segmentation.point_assignment import (
+from pipeline.segmentation.point_votes import (
     dissolve_redundant,
     distance_to_plane,
     touching_pairs,

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from pipeline.compiler import kernel
 from pipeline.model import BoolArray, IntArray, LabelArray
 from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations
-from pipeline.terrain.support import ALONG_CELLS
+from pipeline.terrain.reach import ALONG_CELLS
 
 _DIRECTIONS = np.array([(1, 0), (0, 1), (1, 1), (1, -1), (2, 1), (1, 2), (2, -1), (1, -2)])
 """Rows and columns of a stride to a later cell: every 18 to 27 degrees, so one of them is nearly perpendicular to any

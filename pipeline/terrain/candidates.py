@@ -20,7 +20,7 @@ from pipeline.model import BoolArray, FloatArray, IntArray, KindArray, Reason
 from pipeline.terrain.decks_and_vehicles import are_decks, are_vehicles, deck_detail, shape_figures, vehicle_detail
 from pipeline.terrain.facets import FacetKind
 from pipeline.terrain.fragment_sums import Sum
-from pipeline.terrain.settings import CandidateSettings
+from pipeline.terrain.terrain_settings import CandidateSettings
 
 NOWHERE = 2**62
 """Coordinate of the smallest point of a surface that has none."""

@@ -23,7 +23,7 @@ import numpy as np
 
 from pipeline.model import BoolArray, FloatArray, IntArray
 from pipeline.terrain.fragment_sums import MOMENTS, Sum
-from pipeline.terrain.settings import CandidateSettings
+from pipeline.terrain.terrain_settings import CandidateSettings
 
 # Not settings: between two opposite ends and the shape nearest to them, three sides of a square.
 _MIN_ACROSS, _MAX_ALONG = 2.45, 1.5

@@ -21,7 +21,7 @@ from pipeline.kernels.union_find import numbered_sets, root_of, unite
 from pipeline.model import BoolArray, IntArray, LabelArray
 from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations
 from pipeline.terrain.planar_fitting import MIN_SPREAD
-from pipeline.terrain.support import BLOCK_CELLS, LINK_CELLS
+from pipeline.terrain.reach import BLOCK_CELLS, LINK_CELLS
 
 _STRIDE = 16
 """Cells from one block to the next: each cell lies in nine blocks, so no surface is cut at one place only."""

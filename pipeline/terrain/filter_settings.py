@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, NamedTuple
 
 from pipeline.parameters import Parameters, parameter
-from pipeline.terrain.support import (
+from pipeline.terrain.reach import (
     CLUMP_CELLS,
     GAP_CELLS,
     NEAR_CELLS,

@@ -18,8 +18,8 @@ from pipeline.registry import loaded
 from pipeline.terrain.filter_settings import FILTERS, FoundGround
 from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations, Part, lowest_per_cell, part_around
 from pipeline.terrain.planar_fitting import FEWEST_SIDES, MIN_CELLS, meeting_sides, plane_around, plane_sums, sum_within
-from pipeline.terrain.settings import GroundSettings
-from pipeline.terrain.support import NEAR_CELLS
+from pipeline.terrain.reach import NEAR_CELLS
+from pipeline.terrain.terrain_settings import GroundSettings
 
 _BLOCK = 64
 """Least side in cells of the blocks that are drawn from sums of their own, which stay in the processor's cache."""

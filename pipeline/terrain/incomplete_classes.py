@@ -18,8 +18,8 @@ from pipeline.compiler import kernel
 from pipeline.kernels.normal_equations import solve_plane_moments
 from pipeline.model import BoolArray, FloatArray, IntArray, KindArray
 from pipeline.spatial_hash import points_by_cell
-from pipeline.terrain.settings import VegetationSettings
-from pipeline.terrain.support import PLANARITY_SCALES
+from pipeline.terrain.reach import PLANARITY_SCALES
+from pipeline.terrain.terrain_settings import VegetationSettings
 
 _LEAST_SHARE = 0.25
 """Share of building vertices in a window from which on they say what its plane is. Not a setting: it lies far from both

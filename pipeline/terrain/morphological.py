@@ -22,9 +22,9 @@ from pipeline.terrain.filter_settings import FoundGround, MorphologicalFilterSet
 from pipeline.terrain.lattice import NO_DATA, Elevations, Part, part_around
 from pipeline.terrain.openings import cut_off
 from pipeline.terrain.planar_fitting import plane_around, plane_sums, sum_within
+from pipeline.terrain.reach import CLUMP_CELLS, GAP_CELLS
 from pipeline.terrain.rejoining import rejoined
-from pipeline.terrain.settings import GroundSettings
-from pipeline.terrain.support import CLUMP_CELLS, GAP_CELLS
+from pipeline.terrain.terrain_settings import GroundSettings
 from pipeline.terrain.wide_objects import wide_objects, with_corners
 
 _STEEPEST = 1.5

@@ -13,7 +13,7 @@ import numpy as np
 from pipeline.compiler import kernel
 from pipeline.model import BoolArray, IntArray
 from pipeline.spatial_hash import slot_of_key
-from pipeline.terrain.settings import OutlierSettings
+from pipeline.terrain.terrain_settings import OutlierSettings
 
 _BITS = 21
 """Bits per coordinate in the key of a cube: 2^21 cubes are wider than any tile with its halo."""

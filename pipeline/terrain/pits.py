@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pipeline.compiler import kernel
 from pipeline.terrain.lattice import NO_DATA, Elevations
-from pipeline.terrain.support import PIT_CELLS
+from pipeline.terrain.reach import PIT_CELLS
 
 PIT_MATES = 2
 """At most this many neighbours of a pit are as deep: low outliers come alone or in small groups."""

@@ -19,9 +19,9 @@ from pipeline.compiler import kernel
 from pipeline.model import BoolArray, IntArray, KindArray, LabelArray
 from pipeline.spatial_hash import points_by_cell
 from pipeline.terrain.facets import SceneVertices, VertexKind
-from pipeline.terrain.support import GLASS_NEAR as NEAR
-from pipeline.terrain.support import GLASS_SQUARE_MM as SQUARE_MM
-from pipeline.terrain.support import GLASS_SQUARES as REACH
+from pipeline.terrain.reach import GLASS_NEAR as NEAR
+from pipeline.terrain.reach import GLASS_SQUARE_MM as SQUARE_MM
+from pipeline.terrain.reach import GLASS_SQUARES as REACH
 
 # Not settings: they say what glass is, in neighbours.
 _AROUND = 8

@@ -14,8 +14,8 @@ import numpy as np
 from pipeline.kernels.union_find import united
 from pipeline.model import FloatArray, IntArray
 from pipeline.terrain.flight_passes import Strip, ids_of, passes_of, strip_of
-from pipeline.terrain.settings import StripSettings
 from pipeline.terrain.survey_strips import UNCLEAR, Rows, counted
+from pipeline.terrain.terrain_settings import StripSettings
 
 _FEW_TO_MOVE = 30
 """Fewest squares by which whole strips are moved: those of one roof may lie apart for a reason of its own."""

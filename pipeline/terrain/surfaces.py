@@ -26,7 +26,7 @@ from pipeline.terrain.facets import (
 )
 from pipeline.terrain.fragment_sums import Core, sum_fragments
 from pipeline.terrain.point_assignment import AssignmentLimits, ScenePoints, assign_points
-from pipeline.terrain.settings import SurfaceSettings
+from pipeline.terrain.terrain_settings import SurfaceSettings
 
 _SAME_M = 0.2
 """Farthest that an undecided point lies from the surface of a building that it belongs to. Not a setting: it is the

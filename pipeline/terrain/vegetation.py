@@ -14,8 +14,8 @@ import numpy as np
 from pipeline.compiler import kernel
 from pipeline.model import BoolArray, FloatArray, IntArray, KindArray, LabelArray
 from pipeline.spatial_hash import points_by_cell
-from pipeline.terrain.settings import VegetationSettings
-from pipeline.terrain.support import PLANARITY_SCALES
+from pipeline.terrain.reach import PLANARITY_SCALES
+from pipeline.terrain.terrain_settings import VegetationSettings
 
 _COUNT = 2**20 - 1
 """Three counts of up to a million share one whole number."""

@@ -12,7 +12,7 @@ from pipeline.compiler import kernel
 from pipeline.model import BoolArray, ByteArray
 from pipeline.terrain.lattice import NO_DATA, Elevations
 from pipeline.terrain.openings import dilate_back, erode_once, framed
-from pipeline.terrain.support import COARSE, FILL, NARROW, RIM_CELLS
+from pipeline.terrain.reach import COARSE, FILL, NARROW, RIM_CELLS
 
 _RIM_STEP_MM = 200
 """A corner lies no deeper than this below the wide cells beside it: it is level with them."""

@@ -7,6 +7,6 @@ triangles away from vertices that lie on a straight edge, so that rounding hardl
 go to the diagonal with the smaller coordinates, so that the result does not depend on where a ring starts.
 """
 
-from pipeline.triangulation.faces import triangulate_face
+from pipeline.triangulation.face_triangles import triangulate_face
 
 __all__ = ["triangulate_face"]

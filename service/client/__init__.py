@@ -11,9 +11,8 @@ with Client("http://127.0.0.1:8000") as client:
 It imports httpx and nothing of the engine. The commands `gablework submit`, `watch`, `fetch` and `jobs` use it.
 """
 
-from service.client.answers import Event, FetchedFile, Job, Output, Problem, Submitted, Transfer
-from service.client.clients import AsyncClient, Client
-from service.client.errors import (
+from service.client.client_answers import Event, FetchedFile, Job, Output, Problem, Submitted, Transfer
+from service.client.client_errors import (
     BusyError,
     DamagedError,
     ForbiddenError,
@@ -25,6 +24,7 @@ from service.client.errors import (
     UnauthorizedError,
     UnreachableError,
 )
+from service.client.clients import AsyncClient, Client
 from service.client.upload_memory import UploadMemory
 
 __all__ = [

@@ -13,8 +13,8 @@ from typing import Any, Concatenate, ParamSpec, Self, TypeVar
 import httpx
 
 from pipeline.errors import SettingsError
-from service.client.answers import Event
-from service.client.attempts import PATIENCE_S
+from service.client.client_answers import Event
+from service.client.client_retries import PATIENCE_S
 from service.client.operations import JobRef, Operations
 from service.client.session import Notify, Session, service_key, service_url
 from service.client.transport import AsyncTransport, BlockingTransport, finished

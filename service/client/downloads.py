@@ -13,8 +13,8 @@ from typing import Any
 from urllib.parse import unquote
 
 from pipeline.errors import RunError
-from service.client.answers import FetchedFile, Job, Output, Transfer
-from service.client.errors import DamagedError, JobDismissedError, JobFailedError, RefusedError
+from service.client.client_answers import FetchedFile, Job, Output, Transfer
+from service.client.client_errors import DamagedError, JobDismissedError, JobFailedError, RefusedError
 from service.client.session import Session, path_of
 from service.client.transport import LostError, OpenAnswer
 from service.client.uploads import OnTransfer

@@ -6,8 +6,8 @@ import codecs
 import json
 from collections.abc import AsyncGenerator, AsyncIterator, Iterator
 
-from service.client.answers import OVER, Event
-from service.client.errors import ForeignAnswerError
+from service.client.client_answers import OVER, Event
+from service.client.client_errors import ForeignAnswerError
 from service.client.session import Session, path_of
 from service.client.transport import LostError
 

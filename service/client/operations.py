@@ -11,9 +11,15 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import SettingsError
-from service.client.answers import OVER, Event, FetchedFile, Job, Output, Submitted
+from service.client.client_answers import OVER, Event, FetchedFile, Job, Output, Submitted
+from service.client.client_errors import (
+    ForeignAnswerError,
+    JobDismissedError,
+    JobFailedError,
+    NotFoundError,
+    RefusedError,
+)
 from service.client.downloads import Choice, fetch_output, outputs_of
-from service.client.errors import ForeignAnswerError, JobDismissedError, JobFailedError, NotFoundError, RefusedError
 from service.client.events import follow
 from service.client.session import Session, path_of
 from service.client.transport import LostError

@@ -16,9 +16,8 @@ from urllib.parse import quote, urlencode, urlsplit
 from pipeline import __version__
 from pipeline.backoff import wanted_pause_s
 from pipeline.errors import SettingsError
-from service.client.answers import Problem
-from service.client.attempts import FIRST_CONTACT_S, Attempts, is_passing
-from service.client.errors import (
+from service.client.client_answers import Problem
+from service.client.client_errors import (
     BusyError,
     ForbiddenError,
     ForeignAnswerError,
@@ -27,6 +26,7 @@ from service.client.errors import (
     UnauthorizedError,
     UnreachableError,
 )
+from service.client.client_retries import FIRST_CONTACT_S, Attempts, is_passing
 from service.client.transport import READ_S, Answer, FileBytes, LostError, OpenAnswer, Request, Transport
 
 DEFAULT_URL = "http://127.0.0.1:8000"

@@ -8,8 +8,8 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from pipeline.errors import UnreadableInputError
-from service.client.answers import Transfer
-from service.client.errors import ForeignAnswerError, NotFoundError, RefusedError
+from service.client.client_answers import Transfer
+from service.client.client_errors import ForeignAnswerError, NotFoundError, RefusedError
 from service.client.session import Session, path_of
 from service.client.transport import LAST_BYTES_S, FileBytes, LostError
 from service.client.upload_memory import LocalFile, Remembered, UploadMemory

@@ -27,10 +27,7 @@ from pipeline.runtime.run import run
 from pipeline.runtime.scratch.location import SCRATCH
 from pipeline.settings import RunSettings
 from service.disk import has_no_space
-from service.driver.failures import failure_of
-from service.driver.gathered import gathered_before, note_gathered
-from service.driver.leased_job import LOG
-from service.driver.messages import (
+from service.driver.failure_words import (
     Scrubber,
     classification_digest,
     classification_outcome,
@@ -39,6 +36,9 @@ from service.driver.messages import (
     digest_of,
     outcome,
 )
+from service.driver.failures import failure_of
+from service.driver.gathered import gathered_before, note_gathered
+from service.driver.leased_job import LOG
 from service.driver.workplace import INPUTS
 from service.errors import RequestError
 from service.fetching import Fetched, JobFiles, UploadTable, gather
@@ -46,7 +46,7 @@ from service.files import StateFolder
 from service.jobs import Job, JobRequest, LogLevel
 from service.outputs import write_classification_outputs, write_comparison_outputs, write_echo, write_outputs
 from service.outputs.kinds import RASTERS
-from service.outputs.published import publish
+from service.outputs.published_forms import publish
 from service.settings import ServiceSettings
 
 Done = TypeVar("Done")

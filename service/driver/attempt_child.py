@@ -25,9 +25,9 @@ from pipeline.runtime.monitoring.progress import Event
 from service import traces
 from service.disk import has_no_space
 from service.driver.attempt import AttemptParts, perform
+from service.driver.driver_logs import configure
+from service.driver.failure_words import Scrubber
 from service.driver.leased_job import LOG
-from service.driver.logs import configure
-from service.driver.messages import Scrubber
 from service.errors import NoSpaceError, NoSuchUploadError, ServiceError, UnexpectedError
 from service.files import StateFolder
 from service.jobs import Job, LogLevel, Upload
@@ -224,7 +224,7 @@ def load() -> None:
     import pyarrow.parquet
     import pyproj
 
-    import service.features.writing
+    import service.features.feature_writing
     import service.outputs.merged_cityjson
     import service.outputs.merged_table
     import service.outputs.report  # noqa: F401

@@ -18,8 +18,8 @@ from typing import Any
 
 from pipeline.errors import RunCancelledError, RunError
 from pipeline.io.temporary import remove_left_folders
+from pipeline.runtime.isolation.child_messages import Finished, OutOfMemory, Progressed
 from pipeline.runtime.isolation.child_pool import ChildPool
-from pipeline.runtime.isolation.messages import Finished, OutOfMemory, Progressed
 from pipeline.runtime.isolation.supervision import SupervisedChild, system_kills
 from pipeline.runtime.monitoring.progress import Event
 from pipeline.runtime.scratch.folder import PULSE

@@ -14,9 +14,9 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 from pipeline.runtime.monitoring.progress import Event
+from service.driver.failure_words import Scrubber
 from service.driver.job_log import AttemptLog
-from service.driver.messages import Scrubber
-from service.driver.progress import CLASSIFY_WEIGHTS, WEIGHTS, WORDS, percent
+from service.driver.job_progress import CLASSIFY_WEIGHTS, WEIGHTS, WORDS, percent
 from service.errors import LeaseLostError, StoreError
 from service.jobs import Job, JobEvent, LogLevel
 from service.store import JobStore

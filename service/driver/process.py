@@ -19,13 +19,13 @@ from pipeline.errors import ClusterError
 from pipeline.io.temporary import remove_left_folders
 from pipeline.schedule import Outcome
 from service.driver.attempt_process import DriverParts, InOwnProcess
-from service.driver.attempts import Attempts
+from service.driver.attempt_records import Attempts
 from service.driver.disk_watch import LOOK_S, DiskWatch
+from service.driver.driver_logs import configure, quieten
 from service.driver.janitor import tidy
+from service.driver.job_progress import StepLimits
 from service.driver.leased_job import LOG, LeasedJob, Stop
-from service.driver.logs import configure, quieten
 from service.driver.loops import DATABASE, repeat
-from service.driver.progress import StepLimits
 from service.driver.shared_cluster import SharedCluster
 from service.driver.webhooks import Sender
 from service.errors import LeaseLostError, StoreError

@@ -14,7 +14,7 @@ from pipeline.runtime.cluster.dask_executor import Cluster
 from pipeline.runtime.engine import workers_that_fit
 from pipeline.runtime.monitoring.measurement import cores, memory_bytes
 from pipeline.runtime.monitoring.progress import Event
-from pipeline.runtime.plan import LARGEST_TASK_BYTES
+from pipeline.runtime.run_plan import LARGEST_TASK_BYTES
 from service.driver.leased_job import LOG, LeasedJob
 from service.settings import ServiceSettings
 

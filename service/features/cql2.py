@@ -20,7 +20,7 @@ import numpy as np
 import shapely
 
 from service.errors import RequestError
-from service.features.coordinates import NamedCrs, in_easting_order
+from service.features.feature_crs import NamedCrs, in_easting_order
 from service.features.index import Box, stamp
 from service.features.pages import GEOMETRY, Condition, ShapeTest
 

@@ -20,7 +20,7 @@ import shapely
 from service.features.index import TIMES, Box, Part, RowIndex, parts, stamp
 
 if TYPE_CHECKING:
-    from service.features.coordinates import Geometries, NamedCrs, RunCrs
+    from service.features.feature_crs import Geometries, NamedCrs, RunCrs
 
 GEOMETRY = "geometry"
 """The property that is a geometry."""

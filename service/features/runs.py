@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     import pyarrow.fs as pafs
 
     from pipeline.runtime.manifest import RunManifest
-    from service.features.coordinates import RunCrs
+    from service.features.feature_crs import RunCrs
 
 _log = logging.getLogger("gablework.service")
 _TRUST_S = 5.0
@@ -112,7 +112,7 @@ class OpenRun:
     @functools.cached_property
     def crs(self) -> RunCrs:
         """Its CRS, and those of answers."""
-        from service.features.coordinates import RunCrs
+        from service.features.feature_crs import RunCrs
 
         return RunCrs.of_run(self.index.facts["crs"])
 
@@ -219,7 +219,7 @@ def job_index(index: Path, run_dir: Path) -> RowIndex:
 def _write(index: Path, place: str, filesystem: pafs.FileSystem, manifest: RunManifest) -> None:
     """Write the index of a run; the file appears whole."""
     from pipeline.io.storage import LocalStorage
-    from service.features.writing import write_index
+    from service.features.feature_writing import write_index
 
     with LocalStorage(root=index.parent).putting(index.name) as path:
         write_index(path, place, filesystem, manifest)

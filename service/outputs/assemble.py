@@ -16,11 +16,11 @@ from pipeline.io.storage import LocalStorage
 from service.features.index import NAME as INDEX_NAME
 from service.features.index import RowIndex
 from service.outputs.catalogue import Catalogue, ResultsCrs, stored_outputs
-from service.outputs.files import zip_files
 from service.outputs.kinds import OUTPUTS, chosen
+from service.outputs.output_files import zip_files
 
 if TYPE_CHECKING:
-    from service.features.coordinates import RunCrs
+    from service.features.feature_crs import RunCrs
 
 Progress = Callable[[int, int], None]
 """Gets how much is done, and of how much. An exception from it ends the work and leaves no file."""
@@ -83,8 +83,8 @@ def write_outputs(
     from pipeline.runtime.manifest import NAME as MANIFEST
     from pipeline.runtime.manifest import RunStatus
     from pipeline.runtime.manifest_reading import read_manifest
-    from service.features.coordinates import RunCrs
-    from service.features.writing import write_index
+    from service.features.feature_crs import RunCrs
+    from service.features.feature_writing import write_index
 
     kinds = chosen(wanted)
     known = read_manifest(run_dir)
@@ -125,7 +125,7 @@ def published_tiles(run_dir: Path) -> tuple[list[RunTile], dict[str, str]]:
 
     A tile writes its state last, so the files that the state lists exist.
     """
-    from service.features.writing import in_z_order
+    from service.features.feature_writing import in_z_order
 
     tiles, failed = {}, {}
     for path in (run_dir / "state").glob("*.json"):

@@ -15,11 +15,11 @@ from pathlib import Path
 from typing import Any, Self
 
 from pipeline.export.facts import RecordContext
-from pipeline.export.records import plane_rows
+from pipeline.export.record_rows import plane_rows
 from pipeline.export.tile import building_rows, city_lines
 from pipeline.runtime.stages.model_batch import StoredResult
+from service.features.feature_writing import GrowingIndex
 from service.features.index import NAME
-from service.features.writing import GrowingIndex
 from service.outputs.catalogue import Catalogue, ResultsCrs
 from service.outputs.single_building import SO_FAR_CITY
 

@@ -12,7 +12,7 @@ from service.errors import NoSuchOutputError
 from service.outputs.kinds import KINDS, OUTPUTS, OutputKind
 
 if TYPE_CHECKING:
-    from service.features.coordinates import RunCrs
+    from service.features.feature_crs import RunCrs
 
 NAME = "outputs.json"
 """File name of the catalogue; a folder without it is not finished."""

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 
 from service.outputs.assemble import Progress
 from service.outputs.catalogue import Catalogue, stored_outputs
-from service.outputs.files import zip_files
 from service.outputs.kinds import CLASSIFICATION_OUTPUTS, RASTERS, chosen
+from service.outputs.output_files import zip_files
 
 if TYPE_CHECKING:
     from pipeline.extras.classify.classify import ClassifySummary

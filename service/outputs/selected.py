@@ -162,7 +162,7 @@ def write_selected(
     from pipeline.errors import NothingToShowError
     from pipeline.extras.publish.selection import select_run
     from service.outputs.assemble import write_outputs
-    from service.outputs.published import formats_of, publish
+    from service.outputs.published_forms import formats_of, publish
 
     place.parent.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=".", dir=place.parent) as folder:

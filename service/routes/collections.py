@@ -54,7 +54,7 @@ from service.wire.features import (
 from service.wire.queries import interval, is_interval, window
 
 if TYPE_CHECKING:
-    from service.features.tables import Layer
+    from service.features.feature_tables import Layer
 
 FEATURES = "http://www.opengis.net/spec/ogcapi-features-"
 CQL2 = "http://www.opengis.net/spec/cql2/1.0/conf/"
@@ -212,7 +212,7 @@ def collection(runs: _Runs, base: Base, collection_id: _CollectionId) -> Respons
 
 
 def _described(run: OpenRun, table: str, base: str) -> Collection:
-    from service.features.tables import LAYERS
+    from service.features.feature_tables import LAYERS
 
     totals, layer, name = run.index.totals(table), LAYERS[table], run.collection_id(table)
     place = f"{base}/collections/{name}"
@@ -281,7 +281,7 @@ def schema(runs: _Runs, base: Base, collection_id: _CollectionId) -> Response:
 
 
 def _schema(runs: Catalogue, base: str, collection_id: str, kind: Literal["queryables", "schema"]) -> Response:
-    from service.features.tables import LAYERS
+    from service.features.feature_tables import LAYERS
 
     run, table = runs.opened(collection_id)
     name, layer = run.collection_id(table), LAYERS[table]

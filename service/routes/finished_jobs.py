@@ -25,7 +25,7 @@ from service.files import StateFolder
 from service.jobs import Job, JobStatus
 from service.outputs import Catalogue, read_catalogue, run_outputs
 from service.outputs.catalogue import NOTHING_YET
-from service.outputs.comparison import RUNS
+from service.outputs.comparison_files import RUNS
 from service.outputs.kinds import SELECTABLE
 from service.outputs.selected import Selections, refuse_others
 from service.problems import JobFailedError

@@ -12,7 +12,7 @@ from pipeline.export.folders import POINTS_FOLDER
 from pipeline.extras.octree.point_files import NAMED_FILE, TILESET
 from service.errors import NoSuchOutputError
 from service.outputs.kinds import CITYJSONSEQ, GEOJSON, GEOPARQUET, GLB, JSON, KINDS, OBJ
-from service.outputs.published import FILES, ROOTS, RUN_FILE
+from service.outputs.published_forms import FILES, ROOTS, RUN_FILE
 from service.routes.finished_jobs import FinishedJob, FinishedRun
 from service.routes.results import file_answers, unchanging_file
 

@@ -26,7 +26,7 @@ from service.drafts import Draft, Inline
 from service.errors import RequestError, within
 from service.input_policy import checked_crs
 from service.outputs.kinds import FORMATS
-from service.outputs.published import formats_of
+from service.outputs.published_forms import formats_of
 from service.run_settings import DEFAULTS, VARIANTS, choices, settings_faults, settings_schema
 from service.wire import patterns
 from service.wire.base import OneOf, Request, at_most

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.ground import KEPT_ASIDE, drawn_scenes, figures_of, labels_of, main, product_filter, samples
-from pipeline.terrain.settings import GroundSettings
+from pipeline.terrain.terrain_settings import GroundSettings
 
 
 def test_scenes_are_drawn_alike_each_time_and_know_their_ground() -> None:

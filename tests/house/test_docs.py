@@ -12,15 +12,15 @@ import pytest
 
 from pipeline.batch.batch_file import read_batch
 from pipeline.export.columns import COLUMNS
-from pipeline.export.records import SCHEMAS
+from pipeline.export.record_rows import SCHEMAS
 from pipeline.extras.overrides.overrides_file import overrides_of
-from pipeline.extras.papers.settings import FuzzySartSettings
+from pipeline.extras.papers.paper_settings import FuzzySartSettings
 from pipeline.io import SpatialReference
 from pipeline.model import Reason, RoofType, Status
 from pipeline.parameters import Parameters
 from pipeline.reasons import REASONS
-from pipeline.roof.settings import RoofSettings, RoofTypeSettings
-from pipeline.ruler.epochs.settings import DiffSettings, read_settings
+from pipeline.roof.roof_settings import RoofSettings, RoofTypeSettings
+from pipeline.ruler.epochs.epoch_settings import DiffSettings, read_settings
 from pipeline.settings import RunSettings
 from service.settings import ServiceSettings
 

@@ -49,7 +49,7 @@ def test_the_sources_keep_all_contracts(copied_house: Path) -> None:
             "Steps of a segmentation do not import one another",
         ),
         (
-            "pipeline/runtime/plan.py",
+            "pipeline/runtime/run_plan.py",
             "from dask.distributed import Client",
             "Only the engine's own modules import Dask",
         ),

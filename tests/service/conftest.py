@@ -90,7 +90,7 @@ def local_service(starting: Starting) -> LocalService:
 @pytest.fixture
 def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
     """A service behind a gate, for clients that are programs; its pauses are short."""
-    monkeypatch.setattr("service.client.attempts.BACKOFF", Backoff(first_s=0.01, longest_s=15.0))
+    monkeypatch.setattr("service.client.client_retries.BACKOFF", Backoff(first_s=0.01, longest_s=15.0))
     with Site.opened(tmp_path) as opened:
         yield opened
 

@@ -6,7 +6,7 @@ import pytest
 from live_service import POINTS, las_bytes
 
 from pipeline.errors import CrsError
-from service.driver.messages import Scrubber
+from service.driver.failure_words import Scrubber
 from service.wording import as_inputs
 
 WRONG = "EPSG:2193"

@@ -14,7 +14,8 @@ import pytest
 from driver_bench import Bench
 from processes import LONG_S, wait_for
 
-from service.driver import attempt_process, attempts, process
+from service.driver import attempt_process, process
+from service.driver import attempt_records as attempts
 from service.jobs import Fault, JobStatus
 from service.store import policies
 

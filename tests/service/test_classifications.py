@@ -18,7 +18,7 @@ from pipeline.extras.classify.classify import ClassifyRequest, ClassifySummary, 
 from pipeline.extras.classify.write_classified import ClassifiedFile
 from pipeline.runtime.resources import Resources
 from service.driver.attempt import classify_request
-from service.driver.messages import Scrubber, classification_outcome
+from service.driver.failure_words import Scrubber, classification_outcome
 from service.fetching import Fetched, JobFiles
 from service.jobs import JobRequest, JobStatus
 from service.outputs import CLASSIFICATION_OUTPUTS, write_classification_outputs

@@ -18,7 +18,8 @@ from processes import LONG_S, wait_for
 
 from pipeline.errors import InputError, RunError, SettingsError
 from service import client as api
-from service.client import AsyncClient, Client, answers
+from service.client import AsyncClient, Client
+from service.client import client_answers as answers
 from service.client.events import EventParser
 from service.jobs import Fault, JobFailure, JobStatus
 from service.keys import Scope

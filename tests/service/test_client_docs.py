@@ -12,7 +12,7 @@ from finished_runs import ident, write_comparison, write_run
 from live_service import POINTS, las_bytes
 
 from service.outputs import write_comparison_outputs, write_outputs
-from service.outputs.published import publish
+from service.outputs.published_forms import publish
 
 HOW_TO = Path(__file__).resolve().parents[2] / "docs" / "how_to"
 METHODS = ["fuzzy-sart", "fuzzy-sart:faithful"]

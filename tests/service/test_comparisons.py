@@ -24,7 +24,7 @@ from service.driver.attempt import compare_request
 from service.fetching import JobFiles
 from service.jobs import Fault, InputReference, JobRequest, JobStatus
 from service.outputs import COMPARISON_OUTPUTS, OUTPUTS
-from service.outputs.comparison import RUNS
+from service.outputs.comparison_files import RUNS
 from service.outputs.kinds import ON_REQUEST
 from service.run_settings import VARIANTS
 from service.settings import ServiceSettings
@@ -182,7 +182,7 @@ def test_a_running_comparison_that_is_dismissed_stops_and_leaves_no_file(bench: 
 
 
 def test_a_comparison_whose_cluster_is_lost_is_tried_again(bench: Bench) -> None:
-    bench.patch.setattr("service.driver.attempts.LOST_CLUSTER", Backoff(first_s=0.0))
+    bench.patch.setattr("service.driver.attempt_records.LOST_CLUSTER", Backoff(first_s=0.0))
     job = bench.submit(COMPARISON)
     bench.script.raises(ClusterError("the scheduler was lost"))
     bench.driver()

@@ -17,7 +17,8 @@ from processes import LONG_S, wait_for
 from pipeline.backoff import Backoff
 from pipeline.errors import ClusterError, RunError, UnreadableInputError
 from pipeline.runtime.monitoring.progress import Event
-from service.driver import attempts, process
+from service.driver import attempt_records as attempts
+from service.driver import process
 from service.driver.shared_cluster import SharedCluster, answers
 from service.errors import StoreError
 from service.jobs import Fault, Job, JobFailure, JobStatus

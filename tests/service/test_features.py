@@ -23,14 +23,14 @@ from hypothesis import strategies as st
 from live_service import serving, settings_in
 
 from pipeline.export.geoparquet import read_table
-from pipeline.export.records import KEYS, SCHEMAS
+from pipeline.export.record_rows import KEYS, SCHEMAS
 from pipeline.runtime.manifest import RunStatus
 from service.disk import has_no_space
 from service.errors import RequestError, StartUpError
 from service.features import cql2, pages
 from service.features.cql2 import MAX_DEPTH, MAX_LENGTH, MAX_NESTED, parsed
+from service.features.feature_writing import IndexWriter
 from service.features.runs import check_published, published_runs
-from service.features.writing import IndexWriter
 from service.keys import Scope
 
 TABLES = ("buildings", "planes", "rejected")

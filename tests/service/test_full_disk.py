@@ -212,7 +212,7 @@ def test_the_disk_of_a_folder_that_is_not_there_yet_is_that_of_its_parent(tmp_pa
 
 
 def test_a_run_that_uses_the_reserve_is_stopped_and_tried_again_when_there_is_room(bench: Bench, free: Free) -> None:
-    bench.patch.setattr("service.driver.attempts.NO_SPACE_PAUSE_S", 0.0)
+    bench.patch.setattr("service.driver.attempt_records.NO_SPACE_PAUSE_S", 0.0)
     older, newer = bench.submit(priority=1), bench.submit()
     bench.script.waits()
     bench.script.waits()
@@ -254,7 +254,7 @@ def test_no_job_begins_while_only_the_reserve_is_free(bench: Bench, free: Free) 
 
 
 def test_a_job_that_the_disk_never_has_room_for_fails_with_the_reason(bench: Bench) -> None:
-    bench.patch.setattr("service.driver.attempts.NO_SPACE_PAUSE_S", 0.0)
+    bench.patch.setattr("service.driver.attempt_records.NO_SPACE_PAUSE_S", 0.0)
     errors = [OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "/secret/a") for _ in range(3)]
     failure = bench.failure(*errors)
     assert failure.fault is Fault.NO_SPACE

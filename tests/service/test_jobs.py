@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 import service.jobs
 from pipeline.errors import ClusterError, CrsError, RunError, SettingsError, UnreadableInputError, VersionMismatchError
 from pipeline.runtime.monitoring.log_lines import formatter
+from service.driver.failure_words import Scrubber, digest_of, outcome
 from service.driver.failures import failure_of, is_tried_again
-from service.driver.messages import Scrubber, digest_of, outcome
-from service.driver.progress import CLASSIFY_WEIGHTS, COMPILING, WEIGHTS, WORDS, percent
+from service.driver.job_progress import CLASSIFY_WEIGHTS, COMPILING, WEIGHTS, WORDS, percent
 from service.errors import InputRefusedError, NoSpaceError, NoSuchUploadError, RequestError, StoreError, TooLargeError
 from service.jobs import Fault, InputReference, Job, JobRequest, JobStatus
 from service.settings import ServiceSettings

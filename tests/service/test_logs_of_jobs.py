@@ -14,7 +14,7 @@ from pipeline.errors import ClusterError, UnreadableInputError
 from pipeline.runtime.monitoring.progress import Event
 from service.driver import job_log
 from service.driver.job_log import AttemptLog
-from service.driver.progress import WORDS
+from service.driver.job_progress import WORDS
 from service.errors import StoreError
 from service.jobs import Fault, Job, JobFailure, LogLevel, NewLogLine
 from service.keys import Scope

@@ -21,7 +21,7 @@ from pipeline.export.glb_container import read_document
 from pipeline.extras.party_walls.party_walls_of_run import party_walls
 from pipeline.extras.publish.publishing import Form
 from pipeline.runtime.manifest import RunStatus
-from service.outputs import published
+from service.outputs import published_forms as published
 from service.outputs.kinds import FORMATS, ON_REQUEST, OUTPUTS
 
 WITHOUT_SOLAR = tuple(form for form in FORMATS if form != "solar")

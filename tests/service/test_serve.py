@@ -24,7 +24,7 @@ from pydantic import ValidationError
 from typer.testing import CliRunner
 
 from pipeline.options import ResourceOptions, options_of
-from pipeline.runtime.isolation.limits import MIN_MEMORY_BYTES
+from pipeline.runtime.isolation.process_limits import MIN_MEMORY_BYTES
 from service import supervisor as supervisor_module
 from service.connections import listen
 from service.settings import ServiceSettings

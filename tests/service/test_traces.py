@@ -54,7 +54,7 @@ def test_a_request_that_is_not_traced_makes_a_job_that_is_not(starting: Starting
 def test_all_attempts_lie_below_one_span_of_the_job(
     spans: Spans, bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("service.driver.attempts.LOST_CLUSTER", Backoff(first_s=0.01))
+    monkeypatch.setattr("service.driver.attempt_records.LOST_CLUSTER", Backoff(first_s=0.01))
     with tracing.span("POST /jobs", parent=CLIENT):
         job = bench.submit()
     bench.script.raises(ClusterError("the scheduler is lost"))
@@ -131,7 +131,7 @@ def test_a_job_that_is_dismissed_when_its_driver_is_lost_has_a_span(spans: Spans
 def test_a_job_has_one_span_if_the_answer_to_its_last_write_was_lost(
     spans: Spans, bench: Bench, monkeypatch: pytest.MonkeyPatch, step: str
 ) -> None:
-    monkeypatch.setattr("service.driver.attempts.DATABASE", Backoff(first_s=0.01))
+    monkeypatch.setattr("service.driver.attempt_records.DATABASE", Backoff(first_s=0.01))
     committed, lost = getattr(JobStore, step), []
 
     def then_silence(store: JobStore, *arguments: object, **options: object) -> None:

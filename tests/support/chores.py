@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from pipeline.runtime.isolation.isolated_items import supervise
-from pipeline.runtime.isolation.limits import IsolationLimits
+from pipeline.runtime.isolation.process_limits import IsolationLimits
 from pipeline.runtime.isolation.progress_reports import report_progress
 from pipeline.runtime.scratch.folder import Scratch
 

@@ -12,14 +12,14 @@ import pyarrow.parquet as pq
 import pyproj
 import shapely
 
-from pipeline.export.records import RecordContext, RejectedObject
+from pipeline.export.record_rows import RecordContext, RejectedObject
 from pipeline.export.tile import write_tile
 from pipeline.io.crs import SpatialReference, horizontal_unit_of, vertical_unit_of
 from pipeline.model import BuildingResult, ModelQuality, Reason, RoofType, Status
 from pipeline.ruler.epochs.diff import DiffRequest, diff
-from pipeline.ruler.epochs.settings import DiffSettings
+from pipeline.ruler.epochs.epoch_settings import DiffSettings
 from pipeline.ruler.simulation.roofs import RoofDimensions, RoofShape
-from pipeline.ruler.simulation.scene import Terrain, place_building
+from pipeline.ruler.simulation.simulated_scene import Terrain, place_building
 from pipeline.ruler.simulation.solids import truth_record
 from pipeline.runtime.manifest import InputFile, RunManifest, RunStatus, write_manifest
 

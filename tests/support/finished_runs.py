@@ -17,7 +17,7 @@ import small_buildings as small
 from markupsafe import escape
 from starlette.testclient import TestClient
 
-from pipeline.export.records import RecordContext, RejectedObject
+from pipeline.export.record_rows import RecordContext, RejectedObject
 from pipeline.export.tile import write_tile
 from pipeline.extras.octree.octree_tileset import TilesetNode, root_tileset, tile_tileset
 from pipeline.extras.octree.point_glb import NO_BUILDING, NO_PLANE, NO_RESIDUAL, ModelledPoints, points_glb
@@ -29,7 +29,7 @@ from service.files import StateFolder
 from service.jobs import InputReference, Job, JobFailure, JobRequest
 from service.keys import Scope, new_key
 from service.outputs import write_comparison_outputs, write_outputs
-from service.outputs.published import publish
+from service.outputs.published_forms import publish
 from service.settings import ServiceSettings
 from service.store import JobStore
 

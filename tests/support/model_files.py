@@ -12,7 +12,7 @@ import numpy as np
 import shapely
 import small_buildings as small
 
-from pipeline.export.records import RecordContext
+from pipeline.export.record_rows import RecordContext
 from pipeline.export.tile import write_tile
 from pipeline.io.crs import SpatialReference
 from pipeline.io.crs_given import parse_crs

@@ -14,10 +14,10 @@ from pipeline.model import RoofType
 from pipeline.ruler.evaluation.measure import Measure
 from pipeline.ruler.evaluation.models import RoofModel, RoofSurface
 from pipeline.ruler.evaluation.reference import Conditions, Reference, ReferencePoints
-from pipeline.ruler.evaluation.residuals import BIAS, COVERAGE, RMSE, WITHIN, Tallies
+from pipeline.ruler.evaluation.residual_scores import BIAS, COVERAGE, RMSE, WITHIN, Tallies
 from pipeline.ruler.simulation.random_dimensions import random_dimensions
 from pipeline.ruler.simulation.roofs import RoofShape
-from pipeline.ruler.simulation.scene import Scene, Terrain, place_building
+from pipeline.ruler.simulation.simulated_scene import Scene, Terrain, place_building
 
 ORIGIN = (1000.0, 2000.0, 0.0)
 EXTENT = shapely.box(900.0, 1900.0, 1600.0, 2300.0)

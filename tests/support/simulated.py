@@ -9,8 +9,8 @@ from pipeline.compiler import kernel
 from pipeline.model import FloatArray, LabelArray
 from pipeline.ruler.simulation.first_hit import ROOF, WALL, Ray, cell_of, first_hit, terrain_hit
 from pipeline.ruler.simulation.roofs import FlatPart, RoofDimensions, RoofShape
-from pipeline.ruler.simulation.scene import Building, Scene, Terrain, place_building
 from pipeline.ruler.simulation.scene_arrays import SceneArrays, scene_arrays
+from pipeline.ruler.simulation.simulated_scene import Building, Scene, Terrain, place_building
 
 TWO_LEVELS = RoofDimensions(
     length_m=20.0,

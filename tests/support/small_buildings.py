@@ -8,7 +8,7 @@ import numpy as np
 import shapely
 from shapely import Polygon, unary_union
 
-from pipeline.export.records import RecordContext, RejectedObject
+from pipeline.export.record_rows import RecordContext, RejectedObject
 from pipeline.extras.lods.overhangs import overhanging_solids
 from pipeline.model import (
     BuildingResult,

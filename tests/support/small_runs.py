@@ -11,7 +11,7 @@ from typing import Any
 import pyproj
 import small_buildings as small
 
-from pipeline.export.records import RecordContext, RejectedObject
+from pipeline.export.record_rows import RecordContext, RejectedObject
 from pipeline.export.tile import write_tile
 from pipeline.io import storage_at
 from pipeline.io.crs import SpatialReference

@@ -14,7 +14,7 @@ import numpy as np
 import shapely
 
 from pipeline.ruler.simulation.roofs import RoofDimensions, RoofShape
-from pipeline.ruler.simulation.scene import Building, Scene, Terrain, outline_samples, place_building
+from pipeline.ruler.simulation.simulated_scene import Building, Scene, Terrain, outline_samples, place_building
 
 
 class Work(StrEnum):

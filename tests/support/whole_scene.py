@@ -7,8 +7,8 @@ import numpy as np
 from pipeline.model import IntArray, LabelArray
 from pipeline.scene import WindowPoints, split_tile, terrain_of
 from pipeline.terrain.ground import Terrain
-from pipeline.terrain.settings import ClassesInUse, SceneSettings
 from pipeline.terrain.surfaces import Fragments
+from pipeline.terrain.terrain_settings import ClassesInUse, SceneSettings
 from pipeline.tiling import Window
 
 

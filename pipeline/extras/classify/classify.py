@@ -44,7 +44,7 @@ from pipeline.runtime.scratch.abandoned import locked_folder, remove_abandoned
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.outcomes import Place, key_of, whole
 from pipeline.runtime.scratch.work_folder import locked_work
-from pipeline.runtime.stages.ground import find_ground
+from pipeline.runtime.stages.ground_stage import find_ground
 from pipeline.runtime.stages.ingest import part_of
 from pipeline.runtime.stages.ingested import Ingested, classes_in_use
 from pipeline.runtime.stages.join import join

@@ -30,7 +30,7 @@ from pipeline.runtime.stages.window_points import (
 from pipeline.scene import BUILDING_CLASS, GROUND_CLASS, VEGETATION_CLASSES, WindowPoints
 from pipeline.terrain.ground import ground_points
 from pipeline.terrain.lattice import height_above
-from pipeline.terrain.settings import ClassesInUse, SceneSettings
+from pipeline.terrain.terrain_settings import ClassesInUse, SceneSettings
 from pipeline.tiling import MM, Tile, TileGrid, Window
 
 FOLDER = "classes"

@@ -17,7 +17,7 @@ from pipeline.model import BoolArray, ByteArray, IntArray, KindArray
 from pipeline.spatial_hash import points_by_cell, slot_of_key
 from pipeline.terrain.lattice import NO_DATA
 from pipeline.terrain.pits import PIT_MATES
-from pipeline.terrain.settings import VegetationSettings
+from pipeline.terrain.terrain_settings import VegetationSettings
 from pipeline.terrain.thinning import highest_per_cell
 from pipeline.terrain.vegetation import planarity
 

@@ -29,10 +29,10 @@ from pipeline.extras.classify.laz_writing import (
 )
 from pipeline.io import LocalStorage, ReadOptions, Source, SourceInfo, open_source
 from pipeline.io.crs import SpatialReference
+from pipeline.io.file_facts import PointRecords
 from pipeline.io.formats import LAS
 from pipeline.io.las import LasFile
 from pipeline.io.las_header import WKT_RECORD_ID, ExtendedRecord
-from pipeline.io.records import PointRecords
 from pipeline.io.storage import BLOCK_BYTES
 from pipeline.model import ByteArray, PointCloud
 from pipeline.runtime.scratch.folder import Scratch

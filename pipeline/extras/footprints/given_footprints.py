@@ -18,8 +18,8 @@ from pipeline.extras.footprints.placed_features import off_the_data
 from pipeline.io import shown
 from pipeline.io.reading import one_input
 from pipeline.model import GivenHeights
-from pipeline.roof.settings import FootprintSettings
-from pipeline.runtime.plan import Plan
+from pipeline.roof.roof_settings import FootprintSettings
+from pipeline.runtime.run_plan import Plan
 from pipeline.tiling import MM, Tile, TileGrid
 
 Outline: TypeAlias = Polygon | MultiPolygon

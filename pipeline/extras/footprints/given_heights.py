@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from pipeline.errors import BuildingError
 from pipeline.model import Candidate, GivenHeights, GroundSource, HeightSource, Plane
-from pipeline.roof.settings import FootprintSettings
+from pipeline.roof.roof_settings import FootprintSettings
 
 
 class _Range(NamedTuple):

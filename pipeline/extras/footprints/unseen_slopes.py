@@ -20,7 +20,7 @@ from pipeline.extras.footprints.voids import empty_cells, framed_edges, turned_a
 from pipeline.model import BoolArray, FloatArray, LabelArray, Plane
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.plan import RoofPoints
-from pipeline.roof.settings import RoofSettings
+from pipeline.roof.roof_settings import RoofSettings
 from pipeline.roof.unsupported_faces import ON_PLANE_M, REACH_SPACINGS
 
 # Not settings: they say what a slope, its eave and a ridge are, in terms of the points.

@@ -15,7 +15,7 @@ from pipeline.compiler import kernel
 from pipeline.model import FloatArray, LabelArray
 from pipeline.roof.arrangement.raster_labels import Raster, raster_cells
 from pipeline.roof.footprint import polygons_of
-from pipeline.roof.settings import RoofSettings
+from pipeline.roof.roof_settings import RoofSettings
 
 _PITCH_M = 0.5
 """Cells of the raster on which voids are found: an eighth of the usual void distance."""

@@ -10,7 +10,7 @@ from shapely import MultiPolygon
 
 from pipeline.compiler import kernel
 from pipeline.model import FloatArray, LabelArray
-from pipeline.roof.settings import ArrangementSettings
+from pipeline.roof.roof_settings import ArrangementSettings
 
 _EXTENDED_M = 0.6
 """By so much a piece is made longer at both ends: drawn lines seldom meet exactly."""

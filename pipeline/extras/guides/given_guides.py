@@ -14,8 +14,8 @@ from pipeline.extras.guides.guides_file import read_guides
 from pipeline.io import shown
 from pipeline.io.reading import one_input
 from pipeline.model import Guide
-from pipeline.roof.settings import GUIDE_REACH_M
-from pipeline.runtime.plan import Plan
+from pipeline.roof.roof_settings import GUIDE_REACH_M
+from pipeline.runtime.run_plan import Plan
 from pipeline.tiling import MM, Tile, TileGrid
 
 _ISSUES_NAMED = 10

@@ -19,8 +19,8 @@ from pipeline.terrain.filter_settings import FoundGround, HierarchicalFilterSett
 from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations, Part
 from pipeline.terrain.pits import without_pits
 from pipeline.terrain.planar_fitting import plane_around, plane_sums
-from pipeline.terrain.settings import GroundSettings
-from pipeline.terrain.support import PIT_CELLS
+from pipeline.terrain.reach import PIT_CELLS
+from pipeline.terrain.terrain_settings import GroundSettings
 
 # Not settings: they guard against bad seeds, and pits, cells and steps themselves can be set.
 _CLUMP_MATES = 3

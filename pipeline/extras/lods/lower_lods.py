@@ -20,7 +20,7 @@ from pipeline.model import FloatArray, Plane, RoofFace, Solid
 from pipeline.roof.block import block_plane
 from pipeline.roof.footprint import polygons_of
 from pipeline.roof.partition import RoofPartition
-from pipeline.roof.settings import RoofSettings
+from pipeline.roof.roof_settings import RoofSettings
 from pipeline.roof.simplification import without_idle_vertices
 from pipeline.roof.solid import LodParts, SolidPart, solid_parts
 

@@ -23,8 +23,8 @@ from pipeline.extras.octree.point_octree import CELL_BITS, Cube
 from pipeline.extras.octree.tile_points import TilePoints
 from pipeline.extras.publish_3dtiles.globe import to_globe
 from pipeline.io import storage_at
-from pipeline.runtime.plan import Plan
 from pipeline.runtime.run_context import RunContext
+from pipeline.runtime.run_plan import Plan
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.outcomes import Place, drop_outcomes, key_of, part_of, whole
 from pipeline.runtime.stages.cleanup import writing_points

@@ -13,8 +13,8 @@ from pipeline.extras.octree.coarse_terrain import terrain_spacing
 from pipeline.extras.octree.point_files import INDEX
 from pipeline.extras.octree.tile_points import PointsTask, TilePoints, write_tile_points
 from pipeline.io import storage_at
-from pipeline.runtime.plan import window_bytes
 from pipeline.runtime.run_context import ProgressUnits, RunContext
+from pipeline.runtime.run_plan import window_bytes
 from pipeline.runtime.scratch.outcomes import Files, Place, brief_within, drop_outcomes, key_of
 from pipeline.runtime.stages.cleanup import writing_points
 from pipeline.runtime.stages.ingested import Ingested, classes_in_use, points_by_tile

@@ -19,11 +19,11 @@ from pipeline.extras.footprints.footprint_sites import join_footprints
 from pipeline.extras.footprints.given_footprints import numbers_by_tile
 from pipeline.extras.overrides.overrides_file import Override
 from pipeline.model import Reason
-from pipeline.runtime.plan import split_grid
 from pipeline.runtime.run_context import RunContext
+from pipeline.runtime.run_plan import split_grid
 from pipeline.runtime.scratch.folder import POINT, Scratch
 from pipeline.runtime.stages.cleanup import OVERRIDDEN, REDRAWN
-from pipeline.runtime.stages.ground import Ground
+from pipeline.runtime.stages.ground_stage import Ground
 from pipeline.runtime.stages.ingested import Ingested, classes_in_use, points_by_tile
 from pipeline.runtime.stages.sites import (
     CandidateSite,

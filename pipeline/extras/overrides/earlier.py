@@ -15,7 +15,7 @@ import shapely
 from pipeline import __version__
 from pipeline.errors import RunError, SettingsError
 from pipeline.export.geoparquet import table_dataset
-from pipeline.export.records import KEYS
+from pipeline.export.record_rows import KEYS
 from pipeline.io.locations import has_mark, is_url, shown
 from pipeline.options import ModelFiles, ModelOptions, values_of
 from pipeline.runtime.manifest import RunManifest, RunStatus

@@ -33,8 +33,8 @@ from pipeline.model import Reason, Status
 from pipeline.runtime.cluster.serial_executor import Executor
 from pipeline.runtime.digest import run_digest
 from pipeline.runtime.expected import expected
-from pipeline.runtime.isolation.limits import BUNDLE_SUFFIX
 from pipeline.runtime.isolation.preloading import loads_of
+from pipeline.runtime.isolation.process_limits import BUNDLE_SUFFIX
 from pipeline.runtime.manifest import PAGE, SLOWEST, RunManifest, RunStatus, SlowBuilding, write_manifest
 from pipeline.runtime.monitoring.progress import Listener, Progress, ignore, never
 from pipeline.runtime.request import RunRequest, input_file, plan_inputs, request_record
@@ -46,7 +46,7 @@ from pipeline.runtime.scratch.folder_lock import locked_results
 from pipeline.runtime.scratch.location import run_scratch
 from pipeline.runtime.stages.batch_figures import REJECTED, Modelled
 from pipeline.runtime.stages.gather import gather
-from pipeline.runtime.stages.ground import cells_of_blocks, find_ground
+from pipeline.runtime.stages.ground_stage import cells_of_blocks, find_ground
 from pipeline.runtime.stages.ingest import ingest
 from pipeline.runtime.stages.ingested import Ingested, points_by_tile
 from pipeline.runtime.stages.join import join

@@ -22,7 +22,7 @@ from pipeline.export.decisions import DECISIONS, decision_rows, decisions_path, 
 from pipeline.export.facts import RecordContext, RejectedObject
 from pipeline.export.geoparquet import geo_table, parquet_bytes
 from pipeline.export.obj import obj_text
-from pipeline.export.records import KEYS, SCHEMAS, plane_rows, rejected_row
+from pipeline.export.record_rows import KEYS, SCHEMAS, plane_rows, rejected_row
 from pipeline.export.tile import building_rows, city_lines, mesh_files, mesh_path
 from pipeline.model import BuildingResult
 

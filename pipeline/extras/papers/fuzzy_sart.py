@@ -14,8 +14,8 @@ from pipeline.extras.papers.building_tin import check_extent, ground_around
 from pipeline.extras.papers.facet_clusters import connected_parts, labels_of_points
 from pipeline.extras.papers.fuzzy_sart_clusters import centre_of_building, cluster, facet_vectors
 from pipeline.extras.papers.height_rule import facets_above_z_avg
+from pipeline.extras.papers.paper_settings import FuzzySartSettings
 from pipeline.extras.papers.refinement import planes_of_clusters
-from pipeline.extras.papers.settings import FuzzySartSettings
 from pipeline.geometry import nearest_neighbours, point_spacing_m
 from pipeline.model import BoolArray, FloatArray, PreparedCloud, Segmentation
 from pipeline.prepared_cloud import require_visible

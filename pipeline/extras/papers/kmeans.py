@@ -22,9 +22,9 @@ from pipeline.extras.papers.building_tin import check_extent
 from pipeline.extras.papers.facet_clusters import connected_parts
 from pipeline.extras.papers.facet_smoothing import passes_for_noise, smoothed_normals
 from pipeline.extras.papers.kmeans_normals import FacetClusters, choose_clusters, labels_around
+from pipeline.extras.papers.paper_settings import KMeansSettings
 from pipeline.extras.papers.primitives import BuildingPrimitive, fit_box, fit_gable
 from pipeline.extras.papers.refinement import planes_of_clusters
-from pipeline.extras.papers.settings import KMeansSettings
 from pipeline.extras.papers.surrounding_ground import far_from
 from pipeline.geometry import nearest_neighbours, point_spacing_m
 from pipeline.model import FloatArray, LabelArray, Plane, PlanFace, PreparedCloud, Reason, Segmentation, Tin

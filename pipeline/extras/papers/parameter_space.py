@@ -16,17 +16,21 @@ from pipeline.extras.papers.building_tin import check_extent, ground_around
 from pipeline.extras.papers.cluster_membership import may_be_roof, refine_clusters
 from pipeline.extras.papers.facet_clusters import labels_of_points
 from pipeline.extras.papers.facet_parameters import about_barycentre, cluster_means, facet_parameters
+from pipeline.extras.papers.paper_settings import (
+    ParameterSpace2dSettings,
+    ParameterSpace3dSettings,
+    ParameterSpaceSettings,
+)
 from pipeline.extras.papers.parameter_boxes import coarse_clusters
 from pipeline.extras.papers.region_growing import grow_regions
 from pipeline.extras.papers.roof_trees import classify_2d, classify_3d, plausible_slopes
-from pipeline.extras.papers.settings import ParameterSpace2dSettings, ParameterSpace3dSettings, ParameterSpaceSettings
 from pipeline.extras.papers.single_linkage import cluster_by_linkage
 from pipeline.geometry import nearest_neighbours, point_spacing_m
 from pipeline.model import BoolArray, FloatArray, LabelArray, PreparedCloud, RoofType, Segmentation, Tin
 from pipeline.prepared_cloud import require_visible
 from pipeline.segmentation.facet_geometry import best_fit_planes, facet_areas_m2, kept_clusters, noise_sigma_m
 from pipeline.segmentation.plane_regression import describe_planes
-from pipeline.segmentation.point_assignment import vote_among_neighbours
+from pipeline.segmentation.point_votes import vote_among_neighbours
 from pipeline.tin.delaunay import triangulate, unique_xy
 
 _MIN_POINTS = 4

@@ -14,7 +14,7 @@ import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.model import FloatArray, IntArray, LabelArray
-from pipeline.segmentation.point_assignment import distance_to_plane
+from pipeline.segmentation.point_votes import distance_to_plane
 
 _MIN_GRADIENT = 0.02
 """Rise a metre by which two planes must part: about 1 degree; below it their intersection is anywhere."""

@@ -15,7 +15,7 @@ import numpy.typing as npt
 import shapely
 from shapely import MultiPolygon
 
-from pipeline.extras.party_walls.settings import PartyWallSettings
+from pipeline.extras.party_walls.party_wall_settings import PartyWallSettings
 from pipeline.model import BoolArray, FloatArray, IntArray
 
 Shapes = npt.NDArray[np.object_]

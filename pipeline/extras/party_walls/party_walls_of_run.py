@@ -12,12 +12,12 @@ import numpy as np
 import shapely
 
 from pipeline.errors import SettingsError
-from pipeline.export.coordinates import decimals
 from pipeline.export.result_file import SUFFIX, ResultFile
 from pipeline.export.solid_geometry import SURFACES
+from pipeline.export.stored_coordinates import decimals
 from pipeline.extras.party_walls.contacts import ROUNDED_M, Contacts, Walls, contacts, wall_areas
+from pipeline.extras.party_walls.party_wall_settings import PartyWallSettings
 from pipeline.extras.party_walls.party_wall_tables import TABLES
-from pipeline.extras.party_walls.settings import PartyWallSettings
 from pipeline.extras.publish.finished_run import FinishedRun, Published, file_outside, new_file
 from pipeline.model import BoolArray, FaceKind
 from pipeline.runtime.manifest import RunManifest

@@ -18,9 +18,9 @@ import numpy.typing as npt
 
 from pipeline.errors import EmptyInputError, InconsistentInputError, SettingsError, UnreadableInputError
 from pipeline.extras.ply_ascii.ascii_names import COMMENT, SEPARATORS, columns_of, header_columns, is_complete
-from pipeline.extras.ply_ascii.measuring import measured, whole
+from pipeline.extras.ply_ascii.measured_points import measured, whole
+from pipeline.io.file_facts import FileFacts, PointRecords, Readable, Window
 from pipeline.io.reading import moved
-from pipeline.io.records import FileFacts, PointRecords, Readable, Window
 from pipeline.model import FloatArray
 
 SAMPLE_ROWS = 20_000

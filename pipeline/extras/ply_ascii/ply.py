@@ -15,9 +15,9 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.errors import EmptyInputError, InconsistentInputError, UnreadableInputError
-from pipeline.extras.ply_ascii.measuring import measured, whole
+from pipeline.extras.ply_ascii.measured_points import measured, whole
+from pipeline.io.file_facts import FileFacts, PointRecords, Readable, Window
 from pipeline.io.reading import moved
-from pipeline.io.records import FileFacts, PointRecords, Readable, Window
 
 SCALARS = {
     "char": "i1",

@@ -16,7 +16,7 @@ import pyarrow as pa
 
 from pipeline.errors import RunError
 from pipeline.export.columns import KINDS, kind_of, text_of
-from pipeline.export.records import BUILDINGS
+from pipeline.export.record_rows import BUILDINGS
 from pipeline.export.solid_geometry import SHAPE_COLUMNS
 
 NO_NUMBER = -1.7976931348623157e308

@@ -24,7 +24,7 @@ from pipeline.errors import RunError
 from pipeline.export.columns import COLUMNS, HORIZONTAL, KINDS, TILE_COLUMN, VERTICAL, kind_of, text_of
 from pipeline.export.decisions import DECISIONS
 from pipeline.export.decisions import NAME as DECISIONS_NAME
-from pipeline.export.records import SCHEMAS
+from pipeline.export.record_rows import SCHEMAS
 from pipeline.export.solid_geometry import SOLID_COLUMNS
 from pipeline.extras.publish.finished_run import FinishedRun, Published, file_outside, new_file
 from pipeline.extras.publish_gis.gdal_layers import gdal_options, write_layer

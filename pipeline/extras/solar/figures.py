@@ -9,8 +9,8 @@ import numpy as np
 from pipeline.extras.solar.horizon import Obstacles, horizons
 from pipeline.extras.solar.roof_planes import RoofPlanes
 from pipeline.extras.solar.sectors import SECTORS
-from pipeline.extras.solar.settings import SolarSettings
 from pipeline.extras.solar.sky_view import sky_views
+from pipeline.extras.solar.solar_settings import SolarSettings
 from pipeline.extras.solar.sunlight import received
 from pipeline.extras.solar.weather import YearOfLight
 from pipeline.model import FloatArray, IntArray

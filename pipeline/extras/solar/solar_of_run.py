@@ -17,7 +17,7 @@ from pipeline.extras.publish.finished_run import FinishedRun, Published, file_ou
 from pipeline.extras.solar.figures import Figures, figures
 from pipeline.extras.solar.horizon import obstacles_of
 from pipeline.extras.solar.roof_planes import RoofPlanes
-from pipeline.extras.solar.settings import SolarSettings
+from pipeline.extras.solar.solar_settings import SolarSettings
 from pipeline.extras.solar.solar_table import TABLE
 from pipeline.extras.solar.true_north import convergence_deg, longitude_and_latitude
 from pipeline.extras.solar.weather import Site, Weather, YearOfLight, clear_sky, the_pvlib, weather_of, year_of_light

@@ -9,9 +9,9 @@ from collections.abc import Iterable, Iterator, Mapping
 import numpy as np
 
 from pipeline.export.cityjson import decimals_of, heading, json_line, whole_units
-from pipeline.export.coordinates import SpatialReference, crs_coordinates
 from pipeline.export.folders import TERRAIN_FOLDER
 from pipeline.export.obj import vertex_lines
+from pipeline.export.stored_coordinates import SpatialReference, crs_coordinates
 from pipeline.kernels.union_find import numbered_sets, united
 from pipeline.model import BoolArray, FloatArray, LabelArray
 

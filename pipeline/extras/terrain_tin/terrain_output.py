@@ -12,18 +12,18 @@ from collections.abc import Sequence
 import numpy as np
 
 from pipeline.errors import RunCancelledError, RunError
-from pipeline.export.coordinates import SpatialReference, one_unit
 from pipeline.export.folders import TERRAIN_FOLDER
+from pipeline.export.stored_coordinates import SpatialReference, one_unit
 from pipeline.extras.terrain_tin.terrain_files import in_crs, terrain_lines, terrain_obj, terrain_path
 from pipeline.extras.terrain_tin.terrain_tin import BESIDE_MM, REACH_M, Outline, TerrainMesh, terrain_mesh
 from pipeline.io import storage_at
 from pipeline.model import BuildingResult, FaceKind
-from pipeline.runtime.plan import WINDOW_BASE_BYTES
 from pipeline.runtime.run_context import ProgressUnits, RunContext
+from pipeline.runtime.run_plan import WINDOW_BASE_BYTES
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.outcomes import Files, InParts, Place, brief_within, drop_outcomes, key_of, part_of, whole
 from pipeline.runtime.stages.cleanup import writing_terrain
-from pipeline.runtime.stages.ground import Ground
+from pipeline.runtime.stages.ground_stage import Ground
 from pipeline.runtime.stages.model_batch import stored_results
 from pipeline.runtime.stages.reconstruct import Models
 from pipeline.runtime.stages.window_points import GROUND_FOLDER, surroundings_of

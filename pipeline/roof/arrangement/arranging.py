@@ -12,9 +12,8 @@ from shapely import MultiPolygon, Polygon
 from pipeline.compiler import kernel
 from pipeline.errors import BuildingError
 from pipeline.model import FloatArray, IntArray, LabelArray, Plane, Reason
+from pipeline.roof.arrangement.arranged_faces import corners_of_borders, part_crossings, rings_of_faces, trace_faces
 from pipeline.roof.arrangement.candidate_lines import CandidateLines, border_places, candidate_lines
-from pipeline.roof.arrangement.cells import cell_borders, cell_costs, cells_of_points, points_per_cell, unite_faces
-from pipeline.roof.arrangement.faces import corners_of_borders, part_crossings, rings_of_faces, trace_faces
 from pipeline.roof.arrangement.far_corners import (
     HeightsAround,
     add_costs_of_far_planes,
@@ -29,11 +28,12 @@ from pipeline.roof.arrangement.merged_vertices import merge_vertices, rings_with
 from pipeline.roof.arrangement.minimum_cut import costs_of_all, every_label, expand_labels, neighbour_lists
 from pipeline.roof.arrangement.movable_borders import Borders, edges_of_rings
 from pipeline.roof.arrangement.moved_vertices import move_vertices
+from pipeline.roof.arrangement.plan_cells import cell_borders, cell_costs, cells_of_points, points_per_cell, unite_faces
 from pipeline.roof.arrangement.plane_refit import labels_of_points, refitted_planes, support_of_planes
 from pipeline.roof.arrangement.raster_labels import Limits, limits_at, raster_labels
 from pipeline.roof.arrangement.subdivision import CELLS, EDGES, VERTICES, Subdivision, subdivide, subdivision_of
 from pipeline.roof.partition import RoofPartition
-from pipeline.roof.settings import ArrangementSettings
+from pipeline.roof.roof_settings import ArrangementSettings
 
 _EDGES_PER_LINE = 24
 _SPARE_EDGES = 256

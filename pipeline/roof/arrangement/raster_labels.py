@@ -15,7 +15,7 @@ from pipeline.compiler import kernel
 from pipeline.kernels.sorting import counting_sort, sort_few
 from pipeline.model import FloatArray, IntArray, LabelArray
 from pipeline.roof.arrangement.minimum_cut import Allowed, Costs, Neighbours, cost_of, expand_labels
-from pipeline.roof.settings import ArrangementSettings
+from pipeline.roof.roof_settings import ArrangementSettings
 
 COST_SCALE = 1000
 """Integer cost of one unexplained point."""

@@ -14,7 +14,7 @@ from pipeline.extras.footprints.footprints_file import read_area
 from pipeline.io.crs import SpatialReference
 from pipeline.io.storage import sha256_of
 from pipeline.model import FloatArray
-from pipeline.ruler.evaluation.matching import share_in_extent
+from pipeline.ruler.evaluation.building_matching import share_in_extent
 from pipeline.runtime.manifest import RunManifest
 
 

@@ -15,11 +15,11 @@ from pipeline.errors import RunError
 from pipeline.io import is_url
 from pipeline.io.storage import LocalStorage
 from pipeline.ruler.epochs.agreement import check_agreement
-from pipeline.ruler.epochs.comparing import OnPart, compare_epochs
+from pipeline.ruler.epochs.change_summary import Summary
+from pipeline.ruler.epochs.change_writing import GEOJSON, JSON, PARQUET, GeoJson, geojson_sink, parquet_sink
 from pipeline.ruler.epochs.epoch import Epoch, open_epoch
-from pipeline.ruler.epochs.settings import DiffSettings
-from pipeline.ruler.epochs.summary import Summary
-from pipeline.ruler.epochs.writing import GEOJSON, JSON, PARQUET, GeoJson, geojson_sink, parquet_sink
+from pipeline.ruler.epochs.epoch_comparison import OnPart, compare_epochs
+from pipeline.ruler.epochs.epoch_settings import DiffSettings
 
 FORMAT = 1
 """Version of `changes.json`."""

@@ -23,7 +23,7 @@ from pipeline.io.crs import SpatialReference
 from pipeline.model import FloatArray, IntArray
 from pipeline.ruler.epochs.coverage import Coverage, coverage_of
 from pipeline.ruler.epochs.roof_raster import RoofFaces
-from pipeline.ruler.evaluation.matching import sound_polygons
+from pipeline.ruler.evaluation.building_matching import sound_polygons
 from pipeline.runtime.manifest import RunManifest, RunStatus
 from pipeline.runtime.manifest_reading import read_manifest
 

@@ -9,7 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.model import FloatArray
-from pipeline.ruler.epochs.records import Change, Doubt, Incomparable, Relation
+from pipeline.ruler.epochs.change_records import Change, Doubt, Incomparable, Relation
+from pipeline.ruler.epochs.epoch_settings import DiffSettings
 from pipeline.ruler.epochs.roof_raster import (
     ADDED_M2,
     COMMON_M2,
@@ -20,7 +21,6 @@ from pipeline.ruler.epochs.roof_raster import (
     SHIFT_M,
     UNIFORM_M,
 )
-from pipeline.ruler.epochs.settings import DiffSettings
 from pipeline.ruler.epochs.sides import Side
 
 NEAR = 1.5

@@ -9,7 +9,7 @@ import dataclasses
 import math
 
 from pipeline.report.table import CountTable
-from pipeline.ruler.evaluation.counts import count_tables
+from pipeline.ruler.evaluation.counted_models import count_tables
 from pipeline.ruler.evaluation.definitions import DEFINITIONS
 from pipeline.ruler.evaluation.evaluate import Evaluation
 from pipeline.ruler.evaluation.measure import Better, Definition, Group, Measure

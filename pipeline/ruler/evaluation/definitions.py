@@ -7,19 +7,30 @@ from types import MappingProxyType
 
 from pipeline.ruler.evaluation import (
     delivery,
-    detection,
-    faces,
+    detection_scores,
+    face_scores,
     footprints,
-    ground,
-    residuals,
+    ground_scores,
+    residual_scores,
     roof_types,
     surface,
-    validity,
-    wireframes,
+    validity_scores,
+    wireframe_scores,
 )
 from pipeline.ruler.evaluation.measure import Definition
 
-_MODULES = (delivery, residuals, surface, faces, wireframes, roof_types, footprints, detection, ground, validity)
+_MODULES = (
+    delivery,
+    residual_scores,
+    surface,
+    face_scores,
+    wireframe_scores,
+    roof_types,
+    footprints,
+    detection_scores,
+    ground_scores,
+    validity_scores,
+)
 
 DEFINITIONS: Mapping[str, Definition] = MappingProxyType(
     {definition.name: definition for module in _MODULES for definition in module.DEFINITIONS}

@@ -10,7 +10,7 @@ import numpy as np
 
 from pipeline.model import BoolArray, FloatArray, IntArray, Status
 from pipeline.ruler.evaluation.bootstrap import share
-from pipeline.ruler.evaluation.matching import MIN_SHARE, Matching, excused_models
+from pipeline.ruler.evaluation.building_matching import MIN_SHARE, Matching, excused_models
 from pipeline.ruler.evaluation.measure import Better, Measure, defined
 from pipeline.ruler.evaluation.models import ModelSet, RoofModel
 from pipeline.ruler.evaluation.reference import Reference

@@ -14,8 +14,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from pipeline.model import BoolArray, FloatArray, IntArray, Status
-from pipeline.ruler.evaluation.blocks import block_numbers, joined_building
-from pipeline.ruler.evaluation.matching import MIN_SHARE, Overlaps, overlapping, sound_polygons, summed
+from pipeline.ruler.evaluation.block_scores import block_numbers, joined_building
+from pipeline.ruler.evaluation.building_matching import MIN_SHARE, Overlaps, overlapping, sound_polygons, summed
 from pipeline.ruler.evaluation.models import RoofModel
 from pipeline.ruler.evaluation.reference import Reference
 

@@ -10,19 +10,22 @@ import pyarrow as pa
 import shapely
 
 from pipeline.model import RoofType
-from pipeline.ruler.evaluation import delivery, faces, footprints, roof_types, surface, tables, validity
-from pipeline.ruler.evaluation.blocks import joined_reference
-from pipeline.ruler.evaluation.detection import detect, detection_measures
+from pipeline.ruler.evaluation import delivery, footprints, roof_types, surface
+from pipeline.ruler.evaluation import face_scores as faces
+from pipeline.ruler.evaluation import score_tables as tables
+from pipeline.ruler.evaluation import validity_scores as validity
+from pipeline.ruler.evaluation.block_scores import joined_reference
+from pipeline.ruler.evaluation.building_matching import match_footprints
+from pipeline.ruler.evaluation.detection_scores import detect, detection_measures
 from pipeline.ruler.evaluation.divisions import WholeModels, undivided, whole_models
-from pipeline.ruler.evaluation.ground import FoundGround, ground_blocks, ground_measures
-from pipeline.ruler.evaluation.matching import match_footprints
+from pipeline.ruler.evaluation.ground_scores import FoundGround, ground_blocks, ground_measures
 from pipeline.ruler.evaluation.measure import Measure
 from pipeline.ruler.evaluation.models import ModelSet
-from pipeline.ruler.evaluation.reading.wireframes import WireframeSet
+from pipeline.ruler.evaluation.reading.wireframe_files import WireframeSet
 from pipeline.ruler.evaluation.reference import Reference
-from pipeline.ruler.evaluation.residuals import building_residuals, residual_measures
+from pipeline.ruler.evaluation.residual_scores import building_residuals, residual_measures
 from pipeline.ruler.evaluation.subsets import subsets
-from pipeline.ruler.evaluation.wireframes import WireframeScore, score_wireframes, wireframe_measures
+from pipeline.ruler.evaluation.wireframe_scores import WireframeScore, score_wireframes, wireframe_measures
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -35,7 +38,7 @@ class Evaluation:
     measures: tuple[Measure, ...]
     """Every figure, in the order of the chapters."""
     tables: Mapping[str, pa.Table]
-    """The rows behind the figures by name; see `pipeline.ruler.evaluation.tables`."""
+    """The rows behind the figures by name; see `pipeline.ruler.evaluation.score_tables`."""
     notes: tuple[str, ...]
     """Assumptions and omissions of the measures."""
     wireframes: WireframeSet | None = None

@@ -9,7 +9,7 @@ import numpy as np
 import shapely
 
 from pipeline.model import BoolArray, FloatArray, IntArray
-from pipeline.ruler.evaluation.matching import (
+from pipeline.ruler.evaluation.building_matching import (
     MIN_SHARE,
     Geometries,
     Overlaps,

@@ -8,7 +8,7 @@ import numpy as np
 import shapely
 
 from pipeline.ruler.evaluation.bootstrap import ratio, share
-from pipeline.ruler.evaluation.matching import MIN_SHARE, Geometries, Matching, sound_polygons
+from pipeline.ruler.evaluation.building_matching import MIN_SHARE, Geometries, Matching, sound_polygons
 from pipeline.ruler.evaluation.measure import Better, Measure, defined
 from pipeline.ruler.evaluation.models import RoofModel
 from pipeline.ruler.evaluation.reference import Reference

@@ -18,13 +18,13 @@ from pipeline.extras.footprints.footprints_file import read_footprints
 from pipeline.extras.footprints.placed_features import off_the_data
 from pipeline.io import ReadOptions, open_source, shown
 from pipeline.io.crs import SpatialReference, with_one_vertical
+from pipeline.io.file_facts import Readable
 from pipeline.io.places import file_at
-from pipeline.io.records import Readable
 from pipeline.io.source import Source
 from pipeline.model import RoofType
 from pipeline.quality.residuals import TopSurface, plan_index
 from pipeline.ruler.evaluation.building_raster import PointRaster
-from pipeline.ruler.evaluation.ground import NOT_JUDGED, UNCLASSIFIED
+from pipeline.ruler.evaluation.ground_scores import NOT_JUDGED, UNCLASSIFIED
 from pipeline.ruler.evaluation.models import RoofModel
 from pipeline.ruler.evaluation.reference import Reference, ReferencePoints
 from pipeline.scene import BUILDING_CLASS, GROUND_CLASS

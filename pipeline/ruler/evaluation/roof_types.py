@@ -11,8 +11,8 @@ import numpy as np
 
 from pipeline.model import BoolArray, FloatArray, RoofType
 from pipeline.ruler.evaluation.bootstrap import Sums, share
-from pipeline.ruler.evaluation.faces import FaceScore, FaceVerdict
-from pipeline.ruler.evaluation.matching import Matching
+from pipeline.ruler.evaluation.building_matching import Matching
+from pipeline.ruler.evaluation.face_scores import FaceScore, FaceVerdict
 from pipeline.ruler.evaluation.measure import Better, Measure, defined
 from pipeline.ruler.evaluation.models import RoofModel
 from pipeline.ruler.evaluation.reference import Reference

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from pipeline.model import BoolArray, FloatArray, IntArray
 from pipeline.ruler.evaluation.bootstrap import CONFIDENCE, DRAWS, Statistic, Sums, bootstrap
-from pipeline.ruler.evaluation.matching import summed
+from pipeline.ruler.evaluation.building_matching import summed
 from pipeline.ruler.evaluation.measure import Measure
 from pipeline.ruler.evaluation.reference import Reference
 

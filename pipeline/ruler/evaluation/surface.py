@@ -17,7 +17,7 @@ from pipeline.ruler.evaluation.bootstrap import ratio
 from pipeline.ruler.evaluation.measure import Better, Measure, defined
 from pipeline.ruler.evaluation.models import RoofModel
 from pipeline.ruler.evaluation.reference import Reference
-from pipeline.ruler.evaluation.residuals import BIAS, COVERAGE, RMSE, WITHIN, Tallies, top_surface_of
+from pipeline.ruler.evaluation.residual_scores import BIAS, COVERAGE, RMSE, WITHIN, Tallies, top_surface_of
 from pipeline.ruler.evaluation.subsets import Subset, measured_all
 
 SAMPLE_M = 0.25

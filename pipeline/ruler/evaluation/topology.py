@@ -10,8 +10,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from pipeline.model import BoolArray, IntArray
+from pipeline.ruler.evaluation.building_matching import MIN_SHARE, summed
 from pipeline.ruler.evaluation.face_matching import FaceMatch
-from pipeline.ruler.evaluation.matching import MIN_SHARE, summed
 from pipeline.ruler.evaluation.subsets import Columns
 
 Labels = npt.NDArray[np.object_]

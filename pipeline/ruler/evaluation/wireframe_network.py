@@ -19,7 +19,7 @@ from scipy.spatial import KDTree
 from pipeline.model import BoolArray, FaceKind, FloatArray, IntArray
 from pipeline.ruler.evaluation.models import RoofModel
 from pipeline.ruler.evaluation.reading.coplanar import DISTANCE_M
-from pipeline.ruler.evaluation.reading.wireframes import Wireframe
+from pipeline.ruler.evaluation.reading.wireframe_files import Wireframe
 
 MIN_TURN_DEG = 4.0
 """Two edges that meet at a smaller change of direction are one straight edge."""

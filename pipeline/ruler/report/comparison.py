@@ -25,7 +25,7 @@ from pipeline.extras.compare.compare import (
 )
 from pipeline.io import LocalStorage, ReadOptions, find_inputs
 from pipeline.ruler.evaluation.evaluate import Evaluation
-from pipeline.ruler.evaluation.files import EvaluationRequest, evaluate_files, read_reference
+from pipeline.ruler.evaluation.evaluate_files import EvaluationRequest, evaluate_files, read_reference
 from pipeline.ruler.evaluation.models import ModelSet, RoofModel
 from pipeline.ruler.evaluation.reading import read_models
 from pipeline.ruler.report.comparison_choice import Choice, chosen_buildings

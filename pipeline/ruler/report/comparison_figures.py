@@ -11,7 +11,7 @@ import numpy as np
 
 from pipeline.model import RoofType, Status
 from pipeline.ruler.evaluation.chapters import NOTHING, number_text, printed, unit_sign
-from pipeline.ruler.evaluation.counts import OUTCOMES
+from pipeline.ruler.evaluation.counted_models import OUTCOMES
 from pipeline.ruler.evaluation.definitions import DEFINITIONS
 from pipeline.ruler.report.comparison_records import ComparedBuilding, ComparedRun, Record, reference_of
 

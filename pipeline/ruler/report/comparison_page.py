@@ -12,9 +12,9 @@ from pipeline.report.page_template import page_template
 from pipeline.report.pictures import data_uri
 from pipeline.report.render import ROOF_COLOURS
 from pipeline.ruler.evaluation.chapters import NOTHING
-from pipeline.ruler.evaluation.counts import OUTCOMES
+from pipeline.ruler.evaluation.counted_models import OUTCOMES
+from pipeline.ruler.evaluation.evaluation_writing import INTERVALS, all_notes
 from pipeline.ruler.evaluation.markdown import markdown_cell, markdown_table
-from pipeline.ruler.evaluation.writing import INTERVALS, all_notes
 from pipeline.ruler.report.comparison_choice import RULE, Choice, most_different_first
 from pipeline.ruler.report.comparison_figures import FigureTable, figure, seconds_text
 from pipeline.ruler.report.comparison_pictures import (

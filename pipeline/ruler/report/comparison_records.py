@@ -16,8 +16,8 @@ import shapely
 from pipeline.errors import RunError
 from pipeline.export.geoparquet import geo_metadata, read_table, stored_schema
 from pipeline.model import Status
+from pipeline.ruler.evaluation.building_matching import one_to_one
 from pipeline.ruler.evaluation.evaluate import Evaluation
-from pipeline.ruler.evaluation.matching import one_to_one
 from pipeline.runtime.manifest import RunManifest
 
 FULL_RESIDUAL_M = 0.2

@@ -8,8 +8,8 @@ import pyarrow as pa
 
 from pipeline.report.class_map import ROWS, ClassMap
 from pipeline.report.maps import Entry
-from pipeline.ruler.epochs.records import Change
-from pipeline.ruler.epochs.summary import size_of
+from pipeline.ruler.epochs.change_records import Change
+from pipeline.ruler.epochs.change_summary import size_of
 
 COLOURS = {
     Change.NEW: "#1b9e77",

@@ -14,12 +14,12 @@ from pipeline.io.storage import LocalStorage
 from pipeline.report.class_map import MAX_DRAWN, ClassMap
 from pipeline.report.page_template import page_template
 from pipeline.report.pictures import data_uri
+from pipeline.ruler.epochs.change_records import CHANGES, DOUBTS, INCOMPARABLE, Change, Doubt, Incomparable
+from pipeline.ruler.epochs.change_summary import HEIGHT_EDGES_M, LARGEST
+from pipeline.ruler.epochs.change_writing import PARQUET
 from pipeline.ruler.epochs.diff import Diff
 from pipeline.ruler.epochs.epoch import Epoch
-from pipeline.ruler.epochs.records import CHANGES, DOUBTS, INCOMPARABLE, Change, Doubt, Incomparable
-from pipeline.ruler.epochs.settings import DiffSettings
-from pipeline.ruler.epochs.summary import HEIGHT_EDGES_M, LARGEST
-from pipeline.ruler.epochs.writing import PARQUET
+from pipeline.ruler.epochs.epoch_settings import DiffSettings
 from pipeline.ruler.evaluation.chapters import NOTHING as _NOTHING
 from pipeline.ruler.report.epochs_map import COLOURS
 from pipeline.ruler.report.epochs_pictures import NEW_LINE, OLD_LINE, SIZE_PX, Case, cases

@@ -15,8 +15,8 @@ from matplotlib.collections import PathCollection
 from pipeline.report.perspective import ViewedFace
 from pipeline.report.pictures import blank, paths_of, png_of, set_frame
 from pipeline.report.render import solid_faces
+from pipeline.ruler.epochs.change_records import Change
 from pipeline.ruler.epochs.epoch import Epoch
-from pipeline.ruler.epochs.records import Change
 from pipeline.ruler.report.epochs_map import COLOURS
 from pipeline.ruler.report.model_pictures import corners_of, scale_bar, view_png
 

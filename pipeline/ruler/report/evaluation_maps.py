@@ -12,7 +12,7 @@ import shapely
 
 from pipeline.model import BoolArray, FloatArray, Status
 from pipeline.report.maps import BAD, DOUBTFUL, FAIR, GOOD, MISSING, UNJUDGED, Entry, Map, draw_map
-from pipeline.ruler.evaluation.counts import flags, visible_share
+from pipeline.ruler.evaluation.counted_models import flags, visible_share
 from pipeline.ruler.evaluation.evaluate import Evaluation
 
 SHARES = ((0.95, "#3f86b5"), (0.9, "#8bb8d0"), (0.75, "#e3c15c"), (0.5, "#de8a3e"), (-1.0, "#c2401f"))

@@ -10,10 +10,10 @@ from pipeline.io.storage import LocalStorage
 from pipeline.report.page_template import page_template
 from pipeline.report.pictures import data_uri
 from pipeline.ruler.evaluation.chapters import Chapter, Line, chapters
-from pipeline.ruler.evaluation.counts import breakdowns
+from pipeline.ruler.evaluation.counted_models import breakdowns
 from pipeline.ruler.evaluation.evaluate import Evaluation
+from pipeline.ruler.evaluation.evaluation_writing import INTERVALS, all_notes, subject_sentences
 from pipeline.ruler.evaluation.model_figures import TITLE, model_figures
-from pipeline.ruler.evaluation.writing import INTERVALS, all_notes, subject_sentences
 from pipeline.ruler.report.evaluation_maps import maps
 from pipeline.ruler.report.histograms import charts
 from pipeline.ruler.report.model_pictures import TRUTH_COLOUR, models_view

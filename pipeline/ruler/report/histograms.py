@@ -12,7 +12,7 @@ import pyarrow as pa
 from markupsafe import Markup
 
 from pipeline.model import BoolArray, FloatArray
-from pipeline.ruler.evaluation.counts import flags, floats, visible_share
+from pipeline.ruler.evaluation.counted_models import flags, floats, visible_share
 from pipeline.ruler.report.svg_chart import Axis, Ordinate, category_svg, histogram_svg, rebinned
 
 GOOD_M = 0.2

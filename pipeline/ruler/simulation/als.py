@@ -19,8 +19,8 @@ import numpy.typing as npt
 
 from pipeline.model import BoolArray, ByteArray, FloatArray, LabelArray, PointCloud
 from pipeline.ruler.simulation.beam import COLUMNS, MAX_RETURNS, FlightLine, Survey, scan_lines
-from pipeline.ruler.simulation.scene import Scene
 from pipeline.ruler.simulation.scene_arrays import SceneArrays, scene_arrays
+from pipeline.ruler.simulation.simulated_scene import Scene
 from pipeline.ruler.simulation.strips import ScannerSettings, flight_lines, lines_over, reach_m
 from pipeline.ruler.simulation.survey_faults import fault_rows, move_faulty
 

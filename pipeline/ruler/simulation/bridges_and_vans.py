@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from pipeline.ruler.simulation.scene import Box, Scene, Terrain, turned
+from pipeline.ruler.simulation.simulated_scene import Box, Scene, Terrain, turned
 from pipeline.ruler.simulation.strips import ScannerSettings
 
 BRIDGES = 15

@@ -10,7 +10,7 @@ import numpy as np
 
 from pipeline.model import FloatArray
 from pipeline.ruler.simulation.city_blocks import BLOCK_M, CITY_AZIMUTH_DEG, STREET_M, TALLEST_M, Block
-from pipeline.ruler.simulation.scene import Scene, Terrain, turned, undulating_terrain
+from pipeline.ruler.simulation.simulated_scene import Scene, Terrain, turned, undulating_terrain
 from pipeline.ruler.simulation.street_blocks import in_street_frame
 from pipeline.ruler.simulation.strips import ScannerSettings, reach_m
 

@@ -19,7 +19,7 @@ from pipeline.ruler.simulation.additions import can_have_dormers, random_dormers
 from pipeline.ruler.simulation.plots import PlannedBuilding
 from pipeline.ruler.simulation.random_dimensions import random_dimensions
 from pipeline.ruler.simulation.roofs import RoofDimensions, RoofShape
-from pipeline.ruler.simulation.scene import Building, Defect, Terrain, WetSpot
+from pipeline.ruler.simulation.simulated_scene import Building, Defect, Terrain, WetSpot
 from pipeline.ruler.simulation.street_blocks import StreetBlock
 from pipeline.ruler.simulation.suburb import tree_at
 

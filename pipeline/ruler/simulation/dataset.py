@@ -25,7 +25,7 @@ from typing import Any
 
 from pipeline.errors import InputError, SettingsError
 from pipeline.ruler.simulation.als import ScannerSettings, scan, strip_count
-from pipeline.ruler.simulation.scene import Scene
+from pipeline.ruler.simulation.simulated_scene import Scene
 from pipeline.ruler.simulation.strips import Returns, survey_extent
 from pipeline.ruler.simulation.suites import Suite, suite_named
 from pipeline.ruler.simulation.survey_files import TileFiles, recorded, write_points

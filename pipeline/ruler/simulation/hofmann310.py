@@ -24,7 +24,7 @@ from pipeline.ruler.simulation.als import ScannerSettings
 from pipeline.ruler.simulation.plots import PlannedBuilding, Plot, packed_plots
 from pipeline.ruler.simulation.random_dimensions import random_dimensions
 from pipeline.ruler.simulation.roofs import ROOF_TYPES, RoofDimensions, RoofShape
-from pipeline.ruler.simulation.scene import (
+from pipeline.ruler.simulation.simulated_scene import (
     Building,
     Defect,
     FaultKind,

@@ -14,7 +14,7 @@ import numpy as np
 
 from pipeline.ruler.simulation.plots import PlannedBuilding, Plot, packed_plots
 from pipeline.ruler.simulation.roofs import RoofDimensions, RoofShape
-from pipeline.ruler.simulation.scene import Building, Scene, Terrain, Tree, place_building, undulating_terrain
+from pipeline.ruler.simulation.simulated_scene import Building, Scene, Terrain, Tree, place_building, undulating_terrain
 from pipeline.ruler.simulation.strips import ScannerSettings
 from pipeline.ruler.simulation.suburb import tree_at
 from pipeline.ruler.simulation.sweep import Cell

@@ -9,7 +9,7 @@ import numpy as np
 
 from pipeline.model import FloatArray
 from pipeline.ruler.simulation.roofs import ROOFS, RoofDimensions, RoofShape
-from pipeline.ruler.simulation.scene import Building, Terrain, place_building, turned
+from pipeline.ruler.simulation.simulated_scene import Building, Terrain, place_building, turned
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

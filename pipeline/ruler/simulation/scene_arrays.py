@@ -11,7 +11,7 @@ import numpy as np
 from pipeline.errors import SettingsError
 from pipeline.model import FloatArray, IntArray, LabelArray
 from pipeline.ruler.simulation.roofs import FaceRings
-from pipeline.ruler.simulation.scene import Scene, Terrain
+from pipeline.ruler.simulation.simulated_scene import Scene, Terrain
 
 CELL_M = 5.0
 """Edge of the grid's cells."""

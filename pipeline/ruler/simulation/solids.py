@@ -12,7 +12,7 @@ from pipeline.model import BuildingResult, FaceKind, FloatArray, Plane, RoofFace
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.solid import solid_parts
 from pipeline.ruler.simulation.roof_dimensions import FaceRings
-from pipeline.ruler.simulation.scene import Building
+from pipeline.ruler.simulation.simulated_scene import Building
 from pipeline.ruler.simulation.straight_walls import with_straight_walls
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from pipeline.model import FloatArray
 from pipeline.ruler.simulation.roofs import RoofDimensions, RoofShape
-from pipeline.ruler.simulation.scene import Box, Building, Terrain, Tree, place_building, turned
+from pipeline.ruler.simulation.simulated_scene import Box, Building, Terrain, Tree, place_building, turned
 from pipeline.ruler.simulation.suburb import car_at, tree_at
 
 

@@ -10,8 +10,8 @@ import numpy as np
 from pipeline.model import BoolArray, FloatArray
 from pipeline.parameters import Parameters, parameter
 from pipeline.ruler.simulation.beam import FlightLine
-from pipeline.ruler.simulation.scene import Scene, Terrain
 from pipeline.ruler.simulation.scene_arrays import landing_m, steepest_slope
+from pipeline.ruler.simulation.simulated_scene import Scene, Terrain
 
 _FIRST_GPS_TIME_S = 427_536_018.0
 """Start of the first strip: 1 April 2025, 10:00 UTC, as adjusted standard GPS time."""

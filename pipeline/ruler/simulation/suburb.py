@@ -9,7 +9,7 @@ import shapely
 
 from pipeline.model import FloatArray
 from pipeline.ruler.simulation.roofs import RoofDimensions, RoofShape
-from pipeline.ruler.simulation.scene import (
+from pipeline.ruler.simulation.simulated_scene import (
     Box,
     Building,
     Scene,

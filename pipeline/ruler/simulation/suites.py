@@ -18,7 +18,7 @@ from pipeline.ruler.simulation.low_buildings import CELLS as LOW_CELLS
 from pipeline.ruler.simulation.low_buildings import SCANNER as LOW_SCANNER
 from pipeline.ruler.simulation.low_buildings import low_buildings
 from pipeline.ruler.simulation.roofs import FlatPart, RoofDimensions, RoofShape
-from pipeline.ruler.simulation.scene import Scene, Terrain, place_building, undulating_terrain
+from pipeline.ruler.simulation.simulated_scene import Scene, Terrain, place_building, undulating_terrain
 from pipeline.ruler.simulation.strips import Returns
 from pipeline.ruler.simulation.suburb import suburb, tree_at
 from pipeline.ruler.simulation.sweep import CELLS, Cell, sweep

@@ -9,7 +9,7 @@ import numpy as np
 from pipeline.compiler import kernel
 from pipeline.model import FloatArray, LabelArray
 from pipeline.ruler.simulation.beam import line_state, row_chance
-from pipeline.ruler.simulation.scene import FaultKind, SurveyFault
+from pipeline.ruler.simulation.simulated_scene import FaultKind, SurveyFault
 
 _X0, _Y0, _X1, _Y1, _IS_SHIFT, _DX, _DY, _DZ, _SIN, _COS, _SHARE, _OTHER = range(12)
 

@@ -17,7 +17,7 @@ import pipeline
 from pipeline.io.crs import UNKNOWN_REFERENCE, SpatialReference
 from pipeline.ruler.simulation.als import ScanBlock
 from pipeline.ruler.simulation.beam import MAX_RETURNS
-from pipeline.ruler.simulation.scene import Scene
+from pipeline.ruler.simulation.simulated_scene import Scene
 from pipeline.ruler.simulation.strips import Returns
 
 _DATE = dt.date(2025, 4, 1)

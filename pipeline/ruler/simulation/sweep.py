@@ -14,7 +14,15 @@ from pipeline.ruler.simulation.additions import can_have_dormers, random_dormers
 from pipeline.ruler.simulation.plots import PlannedBuilding, packed_plots
 from pipeline.ruler.simulation.random_dimensions import random_dimensions
 from pipeline.ruler.simulation.roofs import RoofDimensions, RoofShape
-from pipeline.ruler.simulation.scene import Building, Defect, Scene, Terrain, Tree, place_building, undulating_terrain
+from pipeline.ruler.simulation.simulated_scene import (
+    Building,
+    Defect,
+    Scene,
+    Terrain,
+    Tree,
+    place_building,
+    undulating_terrain,
+)
 from pipeline.ruler.simulation.strips import Returns, ScannerSettings
 from pipeline.ruler.simulation.suburb import tree_at
 

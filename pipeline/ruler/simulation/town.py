@@ -11,7 +11,7 @@ import numpy as np
 
 from pipeline.model import FloatArray
 from pipeline.ruler.simulation.roofs import RoofDimensions, RoofShape
-from pipeline.ruler.simulation.scene import Box, Building, Scene, Terrain, Tree, turned, undulating_terrain
+from pipeline.ruler.simulation.simulated_scene import Box, Building, Scene, Terrain, Tree, turned, undulating_terrain
 from pipeline.ruler.simulation.street_blocks import StreetBlock, in_street_frame
 from pipeline.ruler.simulation.suburb import house_size, tree_at
 

@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from pipeline.ruler.simulation.scene import Scene
+from pipeline.ruler.simulation.simulated_scene import Scene
 from pipeline.ruler.simulation.strips import Returns, ScannerSettings
 from pipeline.ruler.simulation.sweep import Cell
 from pipeline.ruler.simulation.trust_houses import (

@@ -13,7 +13,7 @@ from pipeline.ruler.simulation.bridges_and_vans import BRIDGES, bridges_and_vans
 from pipeline.ruler.simulation.plots import PlannedBuilding, packed_plots
 from pipeline.ruler.simulation.random_dimensions import random_dimensions
 from pipeline.ruler.simulation.roofs import RoofDimensions, RoofShape
-from pipeline.ruler.simulation.scene import (
+from pipeline.ruler.simulation.simulated_scene import (
     Box,
     Building,
     Defect,

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from pipeline.model import FloatArray
-from pipeline.ruler.simulation.scene import Scene, Terrain, Tree, turned, undulating_terrain
+from pipeline.ruler.simulation.simulated_scene import Scene, Terrain, Tree, turned, undulating_terrain
 from pipeline.ruler.simulation.suburb import tree_at
 
 Range = tuple[float, float]

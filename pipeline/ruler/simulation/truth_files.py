@@ -17,8 +17,8 @@ import shapely
 import pipeline
 from pipeline.export.facts import RecordContext
 from pipeline.export.tile import write_tile
-from pipeline.ruler.simulation.scene import Building, Scene
 from pipeline.ruler.simulation.seeds import split_of
+from pipeline.ruler.simulation.simulated_scene import Building, Scene
 from pipeline.ruler.simulation.solids import truth_record
 from pipeline.ruler.simulation.strips import ScannerSettings, reached, strip_shifts_m
 from pipeline.ruler.simulation.survey_files import TileFiles, spatial_reference

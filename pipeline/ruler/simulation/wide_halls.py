@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.ruler.simulation.roofs import RoofDimensions, RoofShape
-from pipeline.ruler.simulation.scene import Scene, place_building, undulating_terrain
+from pipeline.ruler.simulation.simulated_scene import Scene, place_building, undulating_terrain
 from pipeline.ruler.simulation.strips import ScannerSettings
 
 SIZE_M = 400.0

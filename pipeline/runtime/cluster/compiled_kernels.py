@@ -12,7 +12,7 @@ from pipeline.segmentation.trial_regions import take_regions
 from pipeline.spatial_hash import points_by_cell
 from pipeline.terrain.facets import classify_facets
 from pipeline.terrain.point_assignment import assign_points
-from pipeline.triangulation.faces import triangulate_rings
+from pipeline.triangulation.face_triangles import triangulate_rings
 
 GROUND = (points_by_cell, classify_facets, assign_points)
 """Kernels of every run that finds ground and buildings in the points alone."""

@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import RunError
-from pipeline.runtime.isolation.messages import (
+from pipeline.runtime.isolation.child_messages import (
     Batch,
     Begun,
     Finished,

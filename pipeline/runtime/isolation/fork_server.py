@@ -36,7 +36,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from pipeline.runtime.isolation import child_main
-from pipeline.runtime.isolation.messages import NUMBER, Frames, Order
+from pipeline.runtime.isolation.child_messages import NUMBER, Frames, Order
 from pipeline.runtime.isolation.start_up import start_own_process
 
 NAME = "gablework-fork"

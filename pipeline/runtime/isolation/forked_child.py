@@ -16,8 +16,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import IO
 
+from pipeline.runtime.isolation.child_messages import NUMBER, Order, frame
 from pipeline.runtime.isolation.fork_server import THREADED, kill_with_group, serve_forked
-from pipeline.runtime.isolation.messages import NUMBER, Order, frame
 from pipeline.runtime.isolation.spawned_child import environment_with_this_package, run_in_starter_thread
 from pipeline.runtime.isolation.start_up import WITHOUT_THREADS
 

@@ -14,7 +14,7 @@ from typing import TypeVar
 from pipeline.errors import RunError
 from pipeline.model import Reason
 from pipeline.runtime.isolation.child_pool import FRUITLESS_STARTS, borrowed_child, start_failure
-from pipeline.runtime.isolation.limits import IsolationLimits, Loss
+from pipeline.runtime.isolation.process_limits import IsolationLimits, Loss
 from pipeline.runtime.isolation.supervision import ChildEnd, EndCause
 from pipeline.runtime.monitoring.progress import never
 

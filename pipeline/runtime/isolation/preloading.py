@@ -21,7 +21,7 @@ _STAGES = (
     "numpy.ma",
     "pipeline.runtime.isolation.isolated_items",
     "pipeline.runtime.stages.ingest",
-    "pipeline.runtime.stages.ground",
+    "pipeline.runtime.stages.ground_stage",
     "pipeline.runtime.stages.split",
     "pipeline.strip_alignment",
 )

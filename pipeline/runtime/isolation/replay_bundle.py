@@ -28,7 +28,7 @@ from pipeline.io import place_below, storage_at
 from pipeline.io.crs import SpatialReference
 from pipeline.methods import ReconstructSettings, method_named
 from pipeline.model import Candidate, FloatArray, GivenHeights, Guide, GuideKind
-from pipeline.runtime.isolation.limits import BUNDLE_SUFFIX
+from pipeline.runtime.isolation.process_limits import BUNDLE_SUFFIX
 from pipeline.settings import RunSettings
 
 _FORMAT = "gablework bundle 2"

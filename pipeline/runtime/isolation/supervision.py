@@ -16,8 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import RunCancelledError
-from pipeline.runtime.isolation.forked_child import read_by_children
-from pipeline.runtime.isolation.messages import (
+from pipeline.runtime.isolation.child_messages import (
     Batch,
     Begun,
     Finished,
@@ -30,6 +29,7 @@ from pipeline.runtime.isolation.messages import (
     Said,
     frame,
 )
+from pipeline.runtime.isolation.forked_child import read_by_children
 from pipeline.runtime.isolation.spawned_child import ChildProcess
 from pipeline.runtime.monitoring.progress import never
 

@@ -8,7 +8,7 @@ import numpy as np
 import shapely
 
 from pipeline.model import BoolArray, Guide, IntArray
-from pipeline.roof.settings import GUIDE_REACH_M
+from pipeline.roof.roof_settings import GUIDE_REACH_M
 from pipeline.runtime.scratch.folder import POINT, Scratch
 from pipeline.runtime.stages.window_points import Surroundings, bucket_paths
 from pipeline.terrain.lattice import CELL_MM

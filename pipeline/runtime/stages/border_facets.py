@@ -18,7 +18,7 @@ from pipeline.kernels.union_find import united
 from pipeline.model import BoolArray, IntArray, KindArray
 from pipeline.runtime.stages.tile_content import mixed
 from pipeline.terrain.facets import FacetKind
-from pipeline.terrain.settings import SurfaceSettings
+from pipeline.terrain.terrain_settings import SurfaceSettings
 from pipeline.tiling import Tile, TileGrid
 
 _SLACK_MM = 2

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 from pipeline.export.facts import CandidateFacts
 from pipeline.runtime.isolation.isolated_items import supervise
-from pipeline.runtime.isolation.limits import IsolationLimits, Loss
+from pipeline.runtime.isolation.process_limits import IsolationLimits, Loss
 from pipeline.runtime.isolation.replay_bundle import Incident
 from pipeline.runtime.stages.gather import gather
 from pipeline.runtime.stages.lost_buildings import NO_BUNDLE, failed_site, quarantined

@@ -11,7 +11,7 @@ from shapely import MultiPolygon, Polygon
 from pipeline.model import BoolArray, IntArray
 from pipeline.scene import BUILDING_CLASS, GROUND_CLASS, WindowPoints, never_roof
 from pipeline.terrain.ground import Terrain, ground_points
-from pipeline.terrain.settings import ClassesInUse, GroundSettings
+from pipeline.terrain.terrain_settings import ClassesInUse, GroundSettings
 from pipeline.tiling import MM, TileGrid
 
 _STRIPS = 2**16 - 1

@@ -19,7 +19,7 @@ from pipeline.io.gps_time import GpsTimeKind, utc_of
 from pipeline.kernels.sorting import radix_order
 from pipeline.model import BoolArray, Candidate, FloatArray, GivenHeights, GroundSource, Guide, IntArray
 from pipeline.quality.roof_returns import MAD_TO_SIGMA
-from pipeline.roof.settings import RoofSettings
+from pipeline.roof.roof_settings import RoofSettings
 from pipeline.runtime.scratch.folder import POINT, Scratch
 from pipeline.runtime.stages.sites import CandidateSite, PointRange
 from pipeline.runtime.stages.window_points import NO_GROUND, NO_POINT, Surroundings, surroundings_of

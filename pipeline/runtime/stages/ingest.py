@@ -20,16 +20,16 @@ import numpy.typing as npt
 
 from pipeline.errors import EmptyInputError, InconsistentInputError, InputError, UnreadableInputError
 from pipeline.io import ReadOptions, SourceInfo, is_url, open_source, shown
+from pipeline.io.file_facts import Share
 from pipeline.io.places import file_at
 from pipeline.io.reading import heard_by, moved, one_input, stalled
-from pipeline.io.records import Share
 from pipeline.io.storage import sha256_of
 from pipeline.io.strays import MOST_STRAYS
 from pipeline.model import IntArray, PointCloud, Reason
 from pipeline.registry import extra
-from pipeline.runtime.isolation.limits import IsolationLimits, Loss
-from pipeline.runtime.plan import is_fetched_by_nodes, shares_of
+from pipeline.runtime.isolation.process_limits import IsolationLimits, Loss
 from pipeline.runtime.run_context import RunContext
+from pipeline.runtime.run_plan import is_fetched_by_nodes, shares_of
 from pipeline.runtime.scratch.folder import POINT, Scratch
 from pipeline.runtime.scratch.outcomes import Files, Place, key_of, whole
 from pipeline.runtime.stages.cleanup import clear_points

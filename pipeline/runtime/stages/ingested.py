@@ -18,7 +18,7 @@ from pipeline.model import FloatArray, IntArray
 from pipeline.runtime.stages.tile_content import ZoneSums, zone_sums_of
 from pipeline.scene import BUILDING_CLASS, GROUND_CLASS, VEGETATION_CLASSES
 from pipeline.terrain.flight_passes import united_slices
-from pipeline.terrain.settings import ClassesInUse
+from pipeline.terrain.terrain_settings import ClassesInUse
 from pipeline.tiling import MM, Tile
 
 _CLASSIFIED_SHARE = 0.05

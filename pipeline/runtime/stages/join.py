@@ -18,7 +18,7 @@ import numpy.typing as npt
 from pipeline.kernels.union_find import united
 from pipeline.model import BoolArray, IntArray
 from pipeline.registry import extra
-from pipeline.roof.settings import RoofSettings
+from pipeline.roof.roof_settings import RoofSettings
 from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.outcomes import (
@@ -33,15 +33,15 @@ from pipeline.runtime.scratch.outcomes import (
 )
 from pipeline.runtime.stages.border_facets import are_beyond, united_by_name
 from pipeline.runtime.stages.cleanup import clear_units
+from pipeline.runtime.stages.divided_units import BorderSites, find_units
 from pipeline.runtime.stages.open_fragments import BorderFacets, Finished, OpenSurfaces, finished
 from pipeline.runtime.stages.sites import UNITS, Joined
 from pipeline.runtime.stages.split import Split, Splits
 from pipeline.runtime.stages.stored_sites import joined_of, store_sites
 from pipeline.runtime.stages.tile_sites import TileSitesFigures, by_owner, figures_of
-from pipeline.runtime.stages.units import BorderSites, find_units
 from pipeline.terrain.candidates import NOWHERE, Surfaces
 from pipeline.terrain.fragment_sums import N_SUMS
-from pipeline.terrain.settings import CandidateSettings, SceneSettings
+from pipeline.terrain.terrain_settings import CandidateSettings, SceneSettings
 from pipeline.tiling import Tile, TileGrid
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from pipeline.errors import RunError
 from pipeline.model import BuildingResult, Reason, Status
-from pipeline.runtime.isolation.limits import BUNDLE_SUFFIX
+from pipeline.runtime.isolation.process_limits import BUNDLE_SUFFIX
 from pipeline.runtime.stages.batch_figures import LOST, BatchFigures
 from pipeline.runtime.stages.sites import CandidateSite
 

@@ -16,7 +16,7 @@ from pipeline.io.crs import SpatialReference
 from pipeline.io.gps_time import GpsTimeKind
 from pipeline.methods import ReconstructSettings
 from pipeline.model import BuildingResult, Candidate, Guide, Reason, Status
-from pipeline.runtime.isolation.limits import IsolationLimits
+from pipeline.runtime.isolation.process_limits import IsolationLimits
 from pipeline.runtime.monitoring.logs import LOG
 from pipeline.runtime.scratch.folder import OpenScratch, Scratch
 from pipeline.runtime.scratch.outcomes import DamagedError, Place, key_of, result_of

@@ -33,8 +33,8 @@ from pipeline.terrain.candidates import (
     unite_levels,
 )
 from pipeline.terrain.facets import FacetKind
-from pipeline.terrain.settings import CandidateSettings, SurfaceSettings
 from pipeline.terrain.surfaces import Fragments
+from pipeline.terrain.terrain_settings import CandidateSettings, SurfaceSettings
 from pipeline.tiling import Tile, TileGrid
 
 

@@ -14,7 +14,7 @@ from shapely.affinity import translate
 
 from pipeline.errors import GableworkError
 from pipeline.io.gps_time import GpsTimeKind
-from pipeline.roof.settings import RoofSettings
+from pipeline.roof.roof_settings import RoofSettings
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.stages.gather import canonical_order, gather, stored_points
 from pipeline.runtime.stages.sites import CandidateSite

@@ -20,9 +20,9 @@ from pipeline.io import LocalStorage, Storage, is_url, storage_at
 from pipeline.io.storage import Puts, sha256_of
 from pipeline.model import BuildingResult, Reason, Status
 from pipeline.quality.detection import confidence_of_rejected
-from pipeline.runtime.isolation.limits import BUNDLE_SUFFIX
-from pipeline.runtime.plan import Plan
+from pipeline.runtime.isolation.process_limits import BUNDLE_SUFFIX
 from pipeline.runtime.run_context import ProgressUnits, RunContext
+from pipeline.runtime.run_plan import Plan
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.outcomes import Files, InParts, Place, brief_of, brief_within, drop_outcomes, key_of
 from pipeline.runtime.stages.batch_figures import BatchFigures

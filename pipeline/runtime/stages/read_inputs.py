@@ -13,9 +13,9 @@ from pipeline.io import shown
 from pipeline.methods import method_named
 from pipeline.model import IntArray
 from pipeline.registry import extra
-from pipeline.runtime.plan import Plan
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.run_context import RunContext
+from pipeline.runtime.run_plan import Plan
 from pipeline.runtime.scratch.outcomes import (
     DamagedError,
     OutcomeTask,
@@ -26,7 +26,7 @@ from pipeline.runtime.scratch.outcomes import (
     run_and_store,
     whole,
 )
-from pipeline.runtime.stages.ground import BlockCells, cells_of_blocks
+from pipeline.runtime.stages.ground_stage import BlockCells, cells_of_blocks
 from pipeline.runtime.stages.ingest import ingest, tasks_of
 from pipeline.runtime.stages.ingested import Ingested, slices_in
 from pipeline.settings import RunSettings

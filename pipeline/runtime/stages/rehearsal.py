@@ -14,19 +14,19 @@ import shapely
 from pipeline.io.temporary import temporary_folder
 from pipeline.methods import METHODS, ReconstructSettings
 from pipeline.model import Candidate
-from pipeline.roof.settings import RoofSettings
+from pipeline.roof.roof_settings import RoofSettings
 from pipeline.runtime.scratch.folder import POINT, Scratch
-from pipeline.runtime.stages.cells import CellsTask, find_cells
-from pipeline.runtime.stages.ground import GroundTask, draw_ground
+from pipeline.runtime.stages.cells_stage import CellsTask, find_cells
+from pipeline.runtime.stages.divided_units import UnitTask, divide
+from pipeline.runtime.stages.ground_stage import GroundTask, draw_ground
 from pipeline.runtime.stages.join import _TILES_ACROSS, blocks_of, finished_within, united_surfaces
 from pipeline.runtime.stages.open_fragments import OpenSurfaces
 from pipeline.runtime.stages.sites import FoundSites
 from pipeline.runtime.stages.split import Split, SplitTask, split_window
 from pipeline.runtime.stages.tile_content import zone_sums
 from pipeline.runtime.stages.tile_sites import TileSites, sites_of
-from pipeline.runtime.stages.units import UnitTask, divide
 from pipeline.scene import BUILDING_CLASS, GROUND_CLASS
-from pipeline.terrain.settings import CandidateSettings, ClassesInUse, SceneSettings
+from pipeline.terrain.terrain_settings import CandidateSettings, ClassesInUse, SceneSettings
 from pipeline.tiling import MM, Tile, TileGrid
 
 _SIDE_M = 24

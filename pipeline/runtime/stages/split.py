@@ -17,12 +17,12 @@ from shapely import MultiPolygon, Polygon
 from pipeline.kernels.sorting import radix_order
 from pipeline.model import IntArray
 from pipeline.registry import extra
-from pipeline.runtime.plan import split_grid, window_bytes
 from pipeline.runtime.run_context import RunContext
+from pipeline.runtime.run_plan import split_grid, window_bytes
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.outcomes import Files, Place, key_of, result_of
 from pipeline.runtime.stages.cleanup import clear_tiles
-from pipeline.runtime.stages.ground import Ground, terrain_of_window, terrain_window
+from pipeline.runtime.stages.ground_stage import Ground, terrain_of_window, terrain_window
 from pipeline.runtime.stages.ingested import Ingested, classes_in_use, content_by_tile, points_by_tile
 from pipeline.runtime.stages.open_fragments import TileSurfaces, open_fragments
 from pipeline.runtime.stages.tile_content import content_of_window
@@ -30,7 +30,7 @@ from pipeline.runtime.stages.window_points import LoadedWindow, folders_of, load
 from pipeline.scene import BUILDING_CLASS, SplitTile, split_tile
 from pipeline.settings import RunSettings
 from pipeline.terrain.lattice import CELL_MM
-from pipeline.terrain.settings import ClassesInUse, SceneSettings
+from pipeline.terrain.terrain_settings import ClassesInUse, SceneSettings
 from pipeline.tiling import MM, Tile, TileGrid
 
 if TYPE_CHECKING:

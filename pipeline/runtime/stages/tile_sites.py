@@ -14,7 +14,7 @@ from pipeline.runtime.stages.open_fragments import Finished
 from pipeline.runtime.stages.sites import CandidateSite, FoundSites, PointRange, RejectedSite, largest_first, object_id
 from pipeline.terrain.candidates import verdicts
 from pipeline.terrain.fragment_sums import Sum
-from pipeline.terrain.settings import CandidateSettings
+from pipeline.terrain.terrain_settings import CandidateSettings
 from pipeline.tiling import Tile, TileGrid
 
 

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pipeline.batch.batch_status import NAME, StatusWriter, buildings_before, read_status
 from pipeline.batch.remaining_time import StageProgress, remaining_s
-from pipeline.batch.status import NAME, StatusWriter, buildings_before, read_status
 from pipeline.errors import RunError
 from pipeline.runtime.monitoring.progress import Event
 from pipeline.runtime.scratch.work_folder import DRIVER_LOCK, locked_file, locked_work

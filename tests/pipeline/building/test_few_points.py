@@ -12,7 +12,7 @@ from pipeline.methods import ReconstructSettings
 from pipeline.model import BuildingResult, Candidate, FloatArray, Reason, RoofType, Status
 from pipeline.quality.validity import check_solid
 from pipeline.recipe import reconstruct_building
-from pipeline.roof.settings import RoofSettings
+from pipeline.roof.roof_settings import RoofSettings
 
 HOUSE = shapely.box(0.0, 0.0, 12.0, 8.0)
 

@@ -14,7 +14,7 @@ from pipeline.recipe import reconstruct_building
 from pipeline.roof import block
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.plan import RoofPoints
-from pipeline.roof.settings import RoofSettings
+from pipeline.roof.roof_settings import RoofSettings
 from pipeline.roof.unsupported_faces import level_unsupported_faces
 
 

@@ -16,7 +16,7 @@ from pipeline.model import BuildingResult, Candidate, FaceKind, Status
 from pipeline.quality.validity import check_solid
 from pipeline.recipe import reconstruct_building
 from pipeline.ruler.simulation.als import ScannerSettings, scan_all
-from pipeline.ruler.simulation.scene import Building, Scene
+from pipeline.ruler.simulation.simulated_scene import Building, Scene
 
 SURVEY = ScannerSettings(pulse_density_per_m2=5.0, range_noise_m=0.04)
 SCENES = range(8)

@@ -13,7 +13,7 @@ from pipeline.methods import OVERHANGS, ReconstructSettings
 from pipeline.model import BuildingResult, Candidate, FaceKind, FloatArray, NoOverhang, Outcome, OverhangSource, Solid
 from pipeline.quality.validity import check_solid
 from pipeline.recipe import reconstruct_building
-from pipeline.roof.settings import RoofSettings
+from pipeline.roof.roof_settings import RoofSettings
 from pipeline.settings import RunSettings
 
 EAVES = shapely.box(0.0, 0.0, 12.0, 8.0)

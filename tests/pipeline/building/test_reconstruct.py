@@ -29,7 +29,7 @@ from pipeline.model import (
 )
 from pipeline.quality.validity import check_solid
 from pipeline.recipe import reconstruct_building
-from pipeline.roof.settings import RoofSettings
+from pipeline.roof.roof_settings import RoofSettings
 
 Install = Callable[[Callable[[Candidate], Segmentation]], None]
 

@@ -13,8 +13,8 @@ from command_line import app
 from typer.testing import CliRunner
 
 from pipeline.batch.batch_file import read_batch
+from pipeline.batch.batch_status import buildings_before
 from pipeline.batch.estimates import estimate
-from pipeline.batch.status import buildings_before
 from pipeline.cli.batching import _end_by_signals
 from pipeline.errors import RunError
 from pipeline.io import storage_at
@@ -126,7 +126,7 @@ def test_the_report_is_that_of_the_last_run_or_none(file: Path, text: str, monke
     def fails(run_dir: str) -> str:
         raise RunError(f"{run_dir} is full")
 
-    monkeypatch.setattr("pipeline.batch.run.write_run_page", fails)
+    monkeypatch.setattr("pipeline.batch.batch_run.write_run_page", fails)
     file.write_text(text)
     code, _, error = call("run", file)
     assert code == 0
@@ -179,7 +179,7 @@ def test_who_comes_second_says_nothing_in_the_status_of_who_came_first(
     make_work(work)
     (work / "status.json").write_text("of the first")
     # both looked before either held the folder
-    monkeypatch.setattr("pipeline.batch.run.refuse_locked", lambda _: None)
+    monkeypatch.setattr("pipeline.batch.batch_run.refuse_locked", lambda _: None)
     with locked_file(work, DRIVER_LOCK):
         code, _, error = call("run", file)
     assert code == 4

@@ -12,11 +12,11 @@ import typer
 from command_line import app, invoke
 
 from pipeline import __version__
-from pipeline.cli.options import worker_count
+from pipeline.cli.command_options import worker_count
 from pipeline.cli.party_walls import party_walls
 from pipeline.cli.solar import solar
-from pipeline.extras.party_walls.settings import PartyWallSettings
-from pipeline.extras.solar.settings import SolarSettings
+from pipeline.extras.party_walls.party_wall_settings import PartyWallSettings
+from pipeline.extras.solar.solar_settings import SolarSettings
 from pipeline.parameters import Parameters
 
 COMMANDS = (

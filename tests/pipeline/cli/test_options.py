@@ -6,7 +6,7 @@ import pytest
 import typer.main
 
 from pipeline.batch.batch_file import TABLES
-from pipeline.batch.keys import as_keys
+from pipeline.batch.batch_keys import as_keys
 from pipeline.cli import command_line
 from pipeline.extras.classify.classify import ClassifyRequest
 from pipeline.options import Option, all_options, option_named

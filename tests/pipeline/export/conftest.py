@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 import small_buildings as small
 
-from pipeline.export.records import RecordContext, RejectedObject
+from pipeline.export.record_rows import RecordContext, RejectedObject
 from pipeline.model import Reason
 
 FOOT_M = 0.3048

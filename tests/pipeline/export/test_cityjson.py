@@ -21,9 +21,9 @@ from faces_by_hand import assert_closed
 from small_buildings import Builder, Contexts
 
 from pipeline.export.cityjson import cityjson_lines
-from pipeline.export.coordinates import one_unit
-from pipeline.export.records import RecordContext, building_row
+from pipeline.export.record_rows import RecordContext, building_row
 from pipeline.export.solid_geometry import SHAPE_COLUMNS
+from pipeline.export.stored_coordinates import one_unit
 from pipeline.export.tile import write_tile
 from pipeline.extras.publish.cityjson_file import city_of
 

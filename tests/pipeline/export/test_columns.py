@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from pipeline.export.cityjson import cityjson_lines, lines_of
 from pipeline.export.columns import COLUMNS, KINDS, VERTICAL, Column, kind_of
 from pipeline.export.geoparquet import geo_table, parquet_bytes
-from pipeline.export.records import KEYS, SCHEMAS
+from pipeline.export.record_rows import KEYS, SCHEMAS
 from pipeline.export.solid_geometry import SHAPE_COLUMNS
 from pipeline.extras.publish.cityjson_file import city_of
 

@@ -18,7 +18,7 @@ from small_buildings import Contexts, RejectedObjects
 
 from pipeline.errors import RunError
 from pipeline.export.geoparquet import read_table
-from pipeline.export.records import BUILDINGS, SCHEMAS, CandidateFacts
+from pipeline.export.record_rows import BUILDINGS, SCHEMAS, CandidateFacts
 from pipeline.export.tile import write_tile
 from pipeline.runtime.digest import ADDED, FIGURES_ONLY, NOT_CONTENT, canonical_rows, run_digest
 

@@ -16,7 +16,7 @@ from small_buildings import Contexts, RejectedObjects
 
 from pipeline.errors import RunError
 from pipeline.export.geoparquet import geo_table, parquet_bytes, read_table, table_dataset
-from pipeline.export.records import SCHEMAS, RecordContext, building_row, plane_rows, rejected_row
+from pipeline.export.record_rows import SCHEMAS, RecordContext, building_row, plane_rows, rejected_row
 from pipeline.export.tile import write_tile
 
 CRSES = ["compound", "feet and metres", "US feet", "unknown"]

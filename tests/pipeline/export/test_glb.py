@@ -14,7 +14,7 @@ from small_buildings import Builder, Contexts
 from pipeline.export.cityjson import cityjson_lines
 from pipeline.export.dimensions import area_vector, volume
 from pipeline.export.glb import glb_bytes
-from pipeline.export.records import RecordContext, building_row
+from pipeline.export.record_rows import RecordContext, building_row
 from pipeline.export.tile import write_tile
 from pipeline.model import BuildingResult, FaceKind
 

@@ -19,12 +19,12 @@ from small_runs import content, moved, write_run
 import pipeline.extras.party_walls.party_walls_of_run as runs
 from pipeline.errors import RunError, SettingsError
 from pipeline.export.geoparquet import read_table
-from pipeline.export.records import RecordContext
+from pipeline.export.record_rows import RecordContext
 from pipeline.export.result_file import ResultFile
 from pipeline.export.tile import write_tile
+from pipeline.extras.party_walls.party_wall_settings import PartyWallSettings
 from pipeline.extras.party_walls.party_wall_tables import BUILDINGS, FACTS, WALLS
 from pipeline.extras.party_walls.party_walls_of_run import party_walls
-from pipeline.extras.party_walls.settings import PartyWallSettings
 from pipeline.model import BuildingResult, Reason, Status
 from pipeline.runtime.digest import run_digest
 from pipeline.runtime.run_tiles import TILES_IN_MEMORY

@@ -16,7 +16,7 @@ import pipeline.extras.publish.cityjson_file
 import pipeline.extras.publish_gis.geopackage
 from pipeline.errors import RunError
 from pipeline.export.geoparquet import read_table
-from pipeline.export.records import KEYS
+from pipeline.export.record_rows import KEYS
 from pipeline.export.tile import write_tile
 from pipeline.extras.publish.cityjson_file import city_of, publish_cityjson
 from pipeline.extras.publish_gis.geopackage import LAYERS, Layer, publish_geopackage, stored_batch

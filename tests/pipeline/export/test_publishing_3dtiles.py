@@ -23,7 +23,7 @@ from pipeline.errors import RunError
 from pipeline.export.columns import KINDS
 from pipeline.export.dimensions import volume
 from pipeline.export.geoparquet import read_table
-from pipeline.export.records import SCHEMAS
+from pipeline.export.record_rows import SCHEMAS
 from pipeline.export.solid_geometry import SHAPE_COLUMNS
 from pipeline.extras.publish_3dtiles import globe_tileset
 from pipeline.extras.publish_3dtiles.globe import geodesy, to_globe

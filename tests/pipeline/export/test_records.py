@@ -10,8 +10,16 @@ import shapely
 import small_buildings as small
 from small_buildings import Builder, Contexts, RejectedObjects
 
-from pipeline.export.coordinates import crs_coordinates, decimals, epsg_code
-from pipeline.export.records import BUILDINGS, PLANES, REJECTED, CandidateFacts, building_row, plane_rows, rejected_row
+from pipeline.export.record_rows import (
+    BUILDINGS,
+    PLANES,
+    REJECTED,
+    CandidateFacts,
+    building_row,
+    plane_rows,
+    rejected_row,
+)
+from pipeline.export.stored_coordinates import crs_coordinates, decimals, epsg_code
 from pipeline.model import Plane
 from pipeline.quality.detection import detection_confidence
 

@@ -24,11 +24,11 @@ from weather_files import write_epw
 import pipeline.extras.solar.solar_of_run as runs
 from pipeline.errors import RunError
 from pipeline.export.geoparquet import read_table
-from pipeline.export.records import RecordContext
+from pipeline.export.record_rows import RecordContext
 from pipeline.export.tile import write_tile
 from pipeline.extras.solar.roof_planes import RoofPlanes
-from pipeline.extras.solar.settings import SolarSettings
 from pipeline.extras.solar.solar_of_run import solar
+from pipeline.extras.solar.solar_settings import SolarSettings
 from pipeline.extras.solar.solar_table import COLUMNS, FACTS
 from pipeline.extras.solar.true_north import convergence_deg
 from pipeline.extras.solar.weather import Site, clear_sky

@@ -17,7 +17,7 @@ from small_buildings import Builder, Contexts
 
 from pipeline.export.dimensions import volume
 from pipeline.export.geoparquet import geo_table, parquet_bytes
-from pipeline.export.records import RecordContext, building_row
+from pipeline.export.record_rows import RecordContext, building_row
 from pipeline.export.solid_geometry import SOLID_COLUMNS, model_at, solid_columns
 from pipeline.model import FaceKind, Solid, SolidFace
 from pipeline.quality.validity import check_solid

@@ -11,7 +11,7 @@ from shapely import Polygon
 from pipeline.errors import UnreadableInputError
 from pipeline.io import ReadOptions, open_source
 from pipeline.io.copc import ENTRY, nodes_within, octree_info
-from pipeline.io.records import Window
+from pipeline.io.file_facts import Window
 
 BOX = (84_010.0, 447_020.0, 84_030.0, 447_040.0)
 

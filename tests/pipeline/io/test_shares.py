@@ -10,7 +10,7 @@ import pytest
 
 from pipeline.errors import InconsistentInputError, UnreadableInputError
 from pipeline.io import ReadOptions, open_source
-from pipeline.io.records import Share
+from pipeline.io.file_facts import Share
 from pipeline.io.source import Findings
 
 BOX = (84_010.0, 447_020.0, 84_030.0, 447_090.0)

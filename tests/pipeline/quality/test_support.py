@@ -12,8 +12,8 @@ from pipeline.errors import SettingsError
 from pipeline.methods import ReconstructSettings
 from pipeline.model import DecisionKind, Outcome, Reason, Status
 from pipeline.quality.detection import confidence_of
-from pipeline.quality.settings import SupportSettings
 from pipeline.quality.support import Support, doubt_of, noise_limits
+from pipeline.quality.support_settings import SupportSettings
 from pipeline.recipe import reconstruct_building
 from pipeline.settings import RunSettings
 

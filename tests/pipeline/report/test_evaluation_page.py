@@ -31,13 +31,13 @@ from roofs_by_hand import flat, reference
 
 from pipeline.report.maps import BAD, GOOD, MISSING, Map
 from pipeline.ruler.evaluation.chapters import printed
-from pipeline.ruler.evaluation.counts import visible_share
+from pipeline.ruler.evaluation.counted_models import visible_share
 from pipeline.ruler.evaluation.definitions import DEFINITIONS
 from pipeline.ruler.evaluation.evaluate import Evaluation, evaluate
-from pipeline.ruler.evaluation.files import EvaluationRequest, evaluate_files
+from pipeline.ruler.evaluation.evaluate_files import EvaluationRequest, evaluate_files
+from pipeline.ruler.evaluation.evaluation_writing import markdown
 from pipeline.ruler.evaluation.models import RoofModel, RoofSurface
 from pipeline.ruler.evaluation.reference import ReferencePoints
-from pipeline.ruler.evaluation.writing import markdown
 from pipeline.ruler.report.evaluation_maps import maps
 from pipeline.ruler.report.evaluation_page import HEADLINE, page, write_page
 from pipeline.ruler.report.histograms import charts

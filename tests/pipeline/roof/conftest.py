@@ -13,7 +13,7 @@ from pipeline.model import Candidate, FloatArray, LabelArray, Plane, Solid
 from pipeline.prepared_cloud import prepare_cloud
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.plan import RoofPlan, RoofPoints, partition_roof, roof_points
-from pipeline.roof.settings import RoofSettings
+from pipeline.roof.roof_settings import RoofSettings
 from pipeline.roof.solid import SolidPart, solid_parts
 from pipeline.roof.traced_forms import plan_forms
 

@@ -20,7 +20,7 @@ from pipeline.quality.validity import check_solid
 from pipeline.roof.arrangement.arranging import arrange
 from pipeline.roof.footprint_in_mm import footprint_in_mm
 from pipeline.roof.partition import RoofPartition
-from pipeline.roof.settings import ArrangementSettings
+from pipeline.roof.roof_settings import ArrangementSettings
 from pipeline.roof.solid import SolidPart, solid_parts
 
 ExactRoofs = Callable[..., Any]

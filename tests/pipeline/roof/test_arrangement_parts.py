@@ -7,16 +7,8 @@ import pytest
 import shapely
 
 from pipeline.model import IntArray, LabelArray
+from pipeline.roof.arrangement.arranged_faces import rings_of_faces
 from pipeline.roof.arrangement.candidate_lines import CandidateLines
-from pipeline.roof.arrangement.cells import (
-    cell_areas_m2,
-    cell_borders,
-    cells_of_points,
-    connected_faces,
-    points_per_cell,
-    unite_faces,
-)
-from pipeline.roof.arrangement.faces import rings_of_faces
 from pipeline.roof.arrangement.minimum_cut import (
     Allowed,
     Costs,
@@ -25,6 +17,14 @@ from pipeline.roof.arrangement.minimum_cut import (
     every_label,
     expand_labels,
     neighbour_lists,
+)
+from pipeline.roof.arrangement.plan_cells import (
+    cell_areas_m2,
+    cell_borders,
+    cells_of_points,
+    connected_faces,
+    points_per_cell,
+    unite_faces,
 )
 from pipeline.roof.arrangement.raster_labels import _SETTLING_ROUNDS, Limits, Raster, _framed, _settle, limits_at
 from pipeline.roof.arrangement.subdivision import (
@@ -40,7 +40,7 @@ from pipeline.roof.arrangement.subdivision import (
     subdivide,
     subdivision_of,
 )
-from pipeline.roof.settings import ArrangementSettings
+from pipeline.roof.roof_settings import ArrangementSettings
 
 
 def random_graph(seed: int, n: int, k: int) -> tuple[IntArray, LabelArray, IntArray]:

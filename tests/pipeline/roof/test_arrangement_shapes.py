@@ -14,7 +14,7 @@ from pipeline.model import FloatArray, LabelArray, Solid
 from pipeline.quality.validity import check_solid
 from pipeline.roof.arrangement.arranging import arrange
 from pipeline.roof.footprint_in_mm import footprint_in_mm
-from pipeline.roof.settings import ArrangementSettings
+from pipeline.roof.roof_settings import ArrangementSettings
 from pipeline.roof.solid import solid_parts
 
 Volume = Callable[[Solid], float]

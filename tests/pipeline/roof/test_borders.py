@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from pipeline.roof.borders import straighten_borders
 from pipeline.roof.partition import RoofPartition, march
-from pipeline.roof.settings import RoofSettings
+from pipeline.roof.roof_settings import RoofSettings
 from pipeline.roof.traced_forms import clip_partition
 from pipeline.tin.delaunay import triangulate
 

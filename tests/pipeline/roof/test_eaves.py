@@ -14,7 +14,7 @@ from shapely import MultiPolygon, Polygon
 from pipeline.roof.eaves import dominant_directions, straighten
 from pipeline.roof.edge_position import EdgePoints
 from pipeline.roof.lines import Run, fitted_run
-from pipeline.roof.settings import RoofSettings
+from pipeline.roof.roof_settings import RoofSettings
 
 SETTINGS = RoofSettings()
 

@@ -14,7 +14,7 @@ from pipeline.model import BoolArray, FloatArray, IntArray
 from pipeline.roof.eaves import straighten
 from pipeline.roof.edge_position import EdgePoints, mixed_pulse_reach_mm, outward_shift_mm
 from pipeline.roof.lines import Run
-from pipeline.roof.settings import RoofSettings
+from pipeline.roof.roof_settings import RoofSettings
 
 LENGTH_M, DEPTH_M = 14.0, 9.0
 BOX_MM = shapely.box(0.0, 0.0, LENGTH_M * 1e3, DEPTH_M * 1e3)

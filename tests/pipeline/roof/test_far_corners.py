@@ -8,7 +8,6 @@ from shapely import MultiPolygon
 
 from pipeline.model import FloatArray
 from pipeline.roof.arrangement.arranging import arrange
-from pipeline.roof.arrangement.cells import cell_areas_m2, cells_of_points
 from pipeline.roof.arrangement.far_corners import (
     add_costs_of_far_planes,
     cut_off_far_corners,
@@ -16,9 +15,10 @@ from pipeline.roof.arrangement.far_corners import (
     heights_raster,
     with_level_planes,
 )
+from pipeline.roof.arrangement.plan_cells import cell_areas_m2, cells_of_points
 from pipeline.roof.arrangement.raster_labels import limits_at
 from pipeline.roof.arrangement.subdivision import FACE, insert_chord, insert_vertex, subdivision_of
-from pipeline.roof.settings import ArrangementSettings
+from pipeline.roof.roof_settings import ArrangementSettings
 
 RISING = (0.5, 0.0, 3.0)
 """A plane that explains the west of a hall, up to x = 8 m."""

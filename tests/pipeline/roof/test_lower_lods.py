@@ -12,7 +12,7 @@ from shapely import Polygon
 from pipeline.extras.lods.lower_lods import level_forms, lower_lods
 from pipeline.model import FaceKind, FloatArray, Plane, Solid
 from pipeline.quality.validity import check_solid
-from pipeline.roof.settings import RoofSettings
+from pipeline.roof.roof_settings import RoofSettings
 from pipeline.roof.simplification import without_idle_vertices
 from pipeline.roof.solid import LodParts, solid_parts
 

@@ -13,7 +13,7 @@ from pipeline.roof.arrangement.merged_vertices import merge_vertices, rings_with
 from pipeline.roof.arrangement.movable_borders import Borders, edges_of_rings
 from pipeline.roof.arrangement.raster_labels import limits_at
 from pipeline.roof.partition import RoofPartition
-from pipeline.roof.settings import ArrangementSettings
+from pipeline.roof.roof_settings import ArrangementSettings
 
 SPACING_M = 0.25
 LIMITS = limits_at(SPACING_M, ArrangementSettings())

@@ -10,7 +10,7 @@ from pipeline.roof.arrangement.arranging import clean_borders
 from pipeline.roof.arrangement.movable_borders import Borders, edges_of_rings
 from pipeline.roof.arrangement.moved_vertices import move_vertices
 from pipeline.roof.arrangement.raster_labels import Limits, limits_at
-from pipeline.roof.settings import ArrangementSettings
+from pipeline.roof.roof_settings import ArrangementSettings
 
 SPACING_M = 0.25
 LIMITS = limits_at(SPACING_M, ArrangementSettings())

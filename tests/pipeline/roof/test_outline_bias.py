@@ -11,10 +11,10 @@ from candidates_by_hand import candidate
 from pipeline.prepared_cloud import prepare_cloud
 from pipeline.roof.block import block_plane
 from pipeline.roof.plan import partition_roof, roof_points
-from pipeline.roof.settings import RoofSettings
+from pipeline.roof.roof_settings import RoofSettings
 from pipeline.ruler.simulation.als import scan_all
-from pipeline.ruler.simulation.scene import Scene
 from pipeline.ruler.simulation.seeds import seed_of
+from pipeline.ruler.simulation.simulated_scene import Scene
 from pipeline.ruler.simulation.sweep import SCANNER, sweep
 
 

@@ -19,7 +19,7 @@ from pipeline.prepared_cloud import prepare_cloud
 from pipeline.quality.validity import check_solid
 from pipeline.roof.partition import MinAreas, RoofPartition, absorb_small_regions, connected_regions, march
 from pipeline.roof.plan import partition_roof, roof_points
-from pipeline.roof.settings import RoofSettings
+from pipeline.roof.roof_settings import RoofSettings
 from pipeline.roof.simplification import simplify_partition, unite_close_vertices
 from pipeline.roof.solid import solid_parts
 from pipeline.roof.traced_forms import plan_forms

@@ -9,8 +9,8 @@ import pytest
 from simulated import placed
 
 from pipeline.model import RoofType
+from pipeline.roof.roof_settings import RoofTypeSettings
 from pipeline.roof.roof_type import roof_type
-from pipeline.roof.settings import RoofTypeSettings
 from pipeline.roof.solid import solid_parts
 from pipeline.ruler.simulation.random_dimensions import random_dimensions
 from pipeline.ruler.simulation.roofs import ROOF_TYPES, RoofShape

@@ -13,7 +13,7 @@ from pipeline.prepared_cloud import prepare_cloud
 from pipeline.quality.residuals import vertical_residuals
 from pipeline.recipe import reconstruct_building
 from pipeline.roof.plan import RoofPoints, roof_points
-from pipeline.roof.settings import RoofSettings
+from pipeline.roof.roof_settings import RoofSettings
 from pipeline.roof.shaded_points import with_shaded_points
 
 LOW_M, HIGH_M = 3.0, 7.0

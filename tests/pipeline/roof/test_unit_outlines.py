@@ -5,7 +5,7 @@ import pytest
 import shapely
 
 from pipeline.model import Candidate, FloatArray, LabelArray
-from pipeline.roof.settings import RoofSettings
+from pipeline.roof.roof_settings import RoofSettings
 from pipeline.roof.unit_outlines import unit_outlines
 
 

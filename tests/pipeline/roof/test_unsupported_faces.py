@@ -11,7 +11,7 @@ from pipeline.model import FloatArray, Plane, Reason
 from pipeline.quality.validity import check_solid
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.plan import RoofPoints
-from pipeline.roof.settings import RoofSettings
+from pipeline.roof.roof_settings import RoofSettings
 from pipeline.roof.solid import solid_parts
 from pipeline.roof.unlike_points import contradiction_of
 from pipeline.roof.unsupported_faces import level_unsupported_faces

@@ -14,7 +14,7 @@ from pipeline.errors import SettingsError
 from pipeline.io import ReadOptions, open_source
 from pipeline.ruler.simulation.dataset import Output, simulate
 from pipeline.settings import RunSettings
-from pipeline.terrain.settings import OTHER, ClassCodeSettings
+from pipeline.terrain.terrain_settings import OTHER, ClassCodeSettings
 
 OWN = {"class-codes": {"ground": [40], "building": [6, 67], "vegetation": [3, 4, 5, 41], "noise": [7, 18, 99]}}
 

@@ -12,8 +12,8 @@ from pipeline.runtime.engine import ALONE_S, SMALL_S, engine_of, executor_for
 from pipeline.runtime.expected import RATES, Expected, expected
 from pipeline.runtime.isolation import preloading
 from pipeline.runtime.monitoring import measurement as machine
-from pipeline.runtime.plan import make_plan
 from pipeline.runtime.resources import SERIAL, Resources
+from pipeline.runtime.run_plan import make_plan
 from pipeline.settings import RunSettings
 
 

@@ -18,7 +18,7 @@ from processes import LONG_S, wait_for
 from pipeline.errors import RunCancelledError, RunError
 from pipeline.runtime.isolation import child_pool, fork_server
 from pipeline.runtime.isolation.isolated_items import supervise
-from pipeline.runtime.isolation.limits import IsolationLimits, Loss
+from pipeline.runtime.isolation.process_limits import IsolationLimits, Loss
 
 LIMITS = IsolationLimits(timeout_s=120.0, memory_bytes=2**30)
 
@@ -189,7 +189,7 @@ held = os.open(sys.argv[1], os.O_RDONLY)
 assert held == 3, held
 from pipeline.runtime.isolation import child_pool
 from pipeline.runtime.isolation.isolated_items import supervise
-from pipeline.runtime.isolation.limits import IsolationLimits
+from pipeline.runtime.isolation.process_limits import IsolationLimits
 child_pool.fork_own_server()
 limits = IsolationLimits(timeout_s=120.0, memory_bytes=2**30)
 for turn in range(2):

@@ -9,13 +9,13 @@ import pytest
 from whole_scene import seen_m
 
 from pipeline.runtime.scratch.folder import POINT, Scratch
-from pipeline.runtime.stages import ground
-from pipeline.runtime.stages.cells import CellsTask, TileCells, find_cells
-from pipeline.runtime.stages.ground import GroundTask, TileGround, draw_ground, terrain_of_window, terrain_window
+from pipeline.runtime.stages import ground_stage as ground
+from pipeline.runtime.stages.cells_stage import CellsTask, TileCells, find_cells
+from pipeline.runtime.stages.ground_stage import GroundTask, TileGround, draw_ground, terrain_of_window, terrain_window
 from pipeline.runtime.stages.window_points import PointState, load_window, surroundings_of
 from pipeline.scene import WindowPoints, terrain_of
 from pipeline.terrain.lattice import NO_DATA
-from pipeline.terrain.settings import APRON_M, ClassesInUse, GroundSettings, OutlierSettings, SceneSettings
+from pipeline.terrain.terrain_settings import APRON_M, ClassesInUse, GroundSettings, OutlierSettings, SceneSettings
 from pipeline.tiling import MM, Tile, TileGrid, Window
 
 SIDE_M = 130

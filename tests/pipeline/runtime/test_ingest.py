@@ -14,9 +14,9 @@ from las_files import write_las
 
 from pipeline.errors import InconsistentInputError, UnreadableInputError
 from pipeline.io import ReadOptions
+from pipeline.io.file_facts import PointRecords
 from pipeline.io.las import LasFile
-from pipeline.io.records import PointRecords
-from pipeline.runtime.isolation.limits import IsolationLimits
+from pipeline.runtime.isolation.process_limits import IsolationLimits
 from pipeline.runtime.scratch.folder import POINT, Scratch
 from pipeline.runtime.stages.ingest import IngestTask, ingest_file
 from pipeline.runtime.stages.ingested import spread_m

@@ -22,9 +22,9 @@ import pipeline.recipe
 from pipeline.errors import RunCancelledError, RunError, SettingsError
 from pipeline.model import Reason
 from pipeline.runtime.isolation import child_main, child_pool
+from pipeline.runtime.isolation.child_messages import Frames, frame
 from pipeline.runtime.isolation.isolated_items import supervise
-from pipeline.runtime.isolation.limits import IsolationLimits, Loss
-from pipeline.runtime.isolation.messages import Frames, frame
+from pipeline.runtime.isolation.process_limits import IsolationLimits, Loss
 from pipeline.runtime.monitoring.progress import Event
 
 LIMITS = IsolationLimits(timeout_s=120.0, memory_bytes=2**30)
@@ -298,7 +298,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have sta
 sys.path.insert(0, sys.argv[1])
 from pipeline.runtime.isolation import child_pool
 from pipeline.runtime.isolation.isolated_items import supervise
-from pipeline.runtime.isolation.limits import IsolationLimits
+from pipeline.runtime.isolation.process_limits import IsolationLimits
 child_pool._LOADS = ()
 import orders_of_a_test
 for _ in supervise(orders_of_a_test.do, [sys.argv[2]], IsolationLimits()):

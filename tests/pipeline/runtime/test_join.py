@@ -30,8 +30,8 @@ from pipeline.terrain.candidates import CONNECTING, NOWHERE, SOLID
 from pipeline.terrain.facets import FacetKind, SceneVertices, VertexKind
 from pipeline.terrain.fragment_sums import N_SUMS, Sum
 from pipeline.terrain.point_assignment import ScenePoints
-from pipeline.terrain.settings import CandidateSettings, ClassesInUse, SceneSettings, SurfaceSettings
 from pipeline.terrain.surfaces import Fragments, fragments_of
+from pipeline.terrain.terrain_settings import CandidateSettings, ClassesInUse, SceneSettings, SurfaceSettings
 from pipeline.tiling import Tile, TileGrid
 from pipeline.tin.delaunay import triangulate
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from pipeline.batch.batch_file import read_batch
-from pipeline.batch.run import run_batch
-from pipeline.batch.status import read_status
+from pipeline.batch.batch_run import run_batch
+from pipeline.batch.batch_status import read_status
 from pipeline.errors import FolderLostError, InputError, RunCancelledError, RunOverError
 from pipeline.extras.classify.classify import ClassifyRequest, classify
 from pipeline.runtime.cluster.local_executor import LocalExecutor

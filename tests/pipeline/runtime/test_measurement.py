@@ -8,7 +8,7 @@ import pytest
 
 from pipeline.runtime.isolation import child_pool
 from pipeline.runtime.isolation.isolated_items import supervise
-from pipeline.runtime.isolation.limits import IsolationLimits
+from pipeline.runtime.isolation.process_limits import IsolationLimits
 from pipeline.runtime.monitoring.measurement import charge, measure
 
 LIMITS = IsolationLimits(timeout_s=120.0, memory_bytes=2**30)

@@ -21,9 +21,9 @@ from pipeline.runtime.cluster.memory_needs import (
     building_bytes,
     declared_bytes,
 )
-from pipeline.runtime.isolation.limits import IsolationLimits
+from pipeline.runtime.isolation.process_limits import IsolationLimits
 from pipeline.runtime.monitoring.progress import Event, Watch
-from pipeline.runtime.plan import window_bytes
+from pipeline.runtime.run_plan import window_bytes
 from pipeline.runtime.stages.model_batch import BatchTask
 from pipeline.tiling import Tile, TileGrid
 

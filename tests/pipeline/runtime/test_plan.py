@@ -17,9 +17,9 @@ from pipeline.runtime import looking, request
 from pipeline.runtime.cluster.serial_executor import Executor, SerialExecutor
 from pipeline.runtime.looking import look_at_all
 from pipeline.runtime.monitoring.progress import Progress, Watch, ignore
-from pipeline.runtime.plan import check_memory, looked_at, make_plan
 from pipeline.runtime.request import RunRequest, plan_inputs
 from pipeline.runtime.resources import Resources
+from pipeline.runtime.run_plan import check_memory, looked_at, make_plan
 from pipeline.settings import RunSettings
 
 

@@ -16,15 +16,15 @@ from faults.asked import environment
 
 import pipeline.recipe
 from pipeline.errors import SettingsError, UnreadableInputError
-from pipeline.extras.papers.settings import FuzzySartSettings
+from pipeline.extras.papers.paper_settings import FuzzySartSettings
 from pipeline.io.crs import SpatialReference
 from pipeline.methods import ReconstructSettings
 from pipeline.model import Candidate, Guide, GuideKind, Status
 from pipeline.recipe import reconstruct_building
-from pipeline.roof.settings import ArrangementSettings, GuideSettings, RoofSettings
+from pipeline.roof.roof_settings import ArrangementSettings, GuideSettings, RoofSettings
 from pipeline.runtime.isolation import child_pool
 from pipeline.runtime.isolation.replay_bundle import Bundle, Incident, read_bundle, write_bundle
-from pipeline.runtime.replay import replay
+from pipeline.runtime.replay_building import replay
 
 FEET = SpatialReference(name="feet", horizontal_unit_m=0.3048, vertical_unit_m=0.3048)
 
@@ -120,7 +120,7 @@ def test_what_is_unknown_comes_back_as_unknown(bundle: Bundle, tmp_path: Path) -
 
 @pytest.mark.parametrize("isolated", [False, True])
 def test_a_replay_models_exactly_what_the_run_would(bundle: Bundle, path: Path, isolated: bool) -> None:
-    from pipeline.runtime.isolation.limits import IsolationLimits
+    from pipeline.runtime.isolation.process_limits import IsolationLimits
 
     here = reconstruct_building(bundle.candidate, bundle.method, bundle.settings)
     there = replay(read_bundle(str(path)), IsolationLimits() if isolated else None).result

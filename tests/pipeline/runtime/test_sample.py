@@ -19,10 +19,10 @@ from pipeline.runtime.engine import Engine
 from pipeline.runtime.expected import RATES, Expected, expected
 from pipeline.runtime.forecast import WORTH_S, forecast
 from pipeline.runtime.monitoring.progress import Progress, ignore
-from pipeline.runtime.plan import Plan, make_plan
 from pipeline.runtime.request import RunRequest, plan_inputs
 from pipeline.runtime.resources import SERIAL, Resources
 from pipeline.runtime.run import run
+from pipeline.runtime.run_plan import Plan, make_plan
 from pipeline.runtime.sample import Sampled, SampleTask, sample_tasks, sample_window, sampled, scaled
 from pipeline.settings import RunSettings
 

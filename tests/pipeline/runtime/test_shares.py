@@ -13,9 +13,9 @@ from one_file_site import Site, one_file_site
 
 from pipeline.errors import UnreadableInputError
 from pipeline.io import ReadOptions, open_source
-from pipeline.io.records import Share
+from pipeline.io.file_facts import Share
 from pipeline.runtime.manifest_reading import read_manifest
-from pipeline.runtime.plan import is_fetched_by_nodes, shares_of
+from pipeline.runtime.run_plan import is_fetched_by_nodes, shares_of
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.stages.ingest import IngestTask, ingest_file
 from pipeline.tiling import TileGrid
@@ -41,15 +41,15 @@ def octree(plain: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def small_shares(monkeypatch: pytest.MonkeyPatch) -> None:
     """Shares of three thousand points."""
-    monkeypatch.setattr("pipeline.runtime.plan._POINTS_PER_SHARE", 3_000)
+    monkeypatch.setattr("pipeline.runtime.run_plan._POINTS_PER_SHARE", 3_000)
 
 
 def test_files_are_cut_by_their_points(plain: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     info = open_source(plain).info
     assert shares_of(info, ReadOptions()) == [None]
-    monkeypatch.setattr("pipeline.runtime.plan._POINTS_PER_SHARE", info.point_count // 4 + 1)
+    monkeypatch.setattr("pipeline.runtime.run_plan._POINTS_PER_SHARE", info.point_count // 4 + 1)
     assert shares_of(info, ReadOptions()) == [Share(number=k, of=4) for k in range(4)]
-    monkeypatch.setattr("pipeline.runtime.plan._MOST_SHARES", 3)
+    monkeypatch.setattr("pipeline.runtime.run_plan._MOST_SHARES", 3)
     assert len(shares_of(info, ReadOptions())) == 3
     np.savetxt(tmp_path / "a.xyz", np.random.default_rng(1).uniform(0, 50, (info.point_count, 3)))
     assert shares_of(open_source(tmp_path / "a.xyz").info, ReadOptions()) == [None]
@@ -77,7 +77,7 @@ def test_classes_of_a_file_in_shares_come_back_in_its_order(
     plain: Path, run_classify: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = run_classify(plain, settings={"tile_size_m": 40.0})
-    monkeypatch.setattr("pipeline.runtime.plan._POINTS_PER_SHARE", 3_000)
+    monkeypatch.setattr("pipeline.runtime.run_plan._POINTS_PER_SHARE", 3_000)
     cut = run_classify(plain, settings={"tile_size_m": 40.0})
     contents = [Path(summary.files[0].path).read_bytes() for summary in (whole, cut)]
     assert contents[0] == contents[1]
@@ -128,7 +128,7 @@ def test_a_window_of_a_remote_octree_is_the_window_of_the_file(
 ) -> None:
     here = reconstruct(octree, bbox=half)
     there = reconstruct(site.url, bbox=half)
-    monkeypatch.setattr("pipeline.runtime.plan._POINTS_PER_SHARE", 3_000)
+    monkeypatch.setattr("pipeline.runtime.run_plan._POINTS_PER_SHARE", 3_000)
     cut = reconstruct(site.url, bbox=half)
     assert here.digest == there.digest == cut.digest
     figures = [[summary.counts[k] for k in ("points", "dropped_outside")] for summary in (here, there, cut)]

@@ -16,16 +16,16 @@ from hypothesis import strategies as st
 from pipeline.errors import RunCancelledError
 from pipeline.io.gps_time import GpsTimeKind
 from pipeline.recipe import ReconstructSettings, reconstruct_building
-from pipeline.roof.settings import RoofSettings
+from pipeline.roof.roof_settings import RoofSettings
 from pipeline.runtime.scratch.folder import POINT, Scratch
+from pipeline.runtime.stages.divided_units import UnitTask, divide, is_intact, shares_of
 from pipeline.runtime.stages.gather import gather, points_of
 from pipeline.runtime.stages.outline import outlined
 from pipeline.runtime.stages.sites import CandidateSite, PointRange, largest_first, object_id
 from pipeline.runtime.stages.stored_sites import SitesBrief
-from pipeline.runtime.stages.units import UnitTask, divide, is_intact, shares_of
 from pipeline.runtime.stages.window_points import NO_GROUND, NO_POINT
 from pipeline.terrain.lattice import CELL_MM
-from pipeline.terrain.settings import SceneSettings, UnitSettings
+from pipeline.terrain.terrain_settings import SceneSettings, UnitSettings
 from pipeline.tiling import Tile, TileGrid
 
 CRS = "EPSG:28992"

@@ -22,10 +22,10 @@ from pipeline.io import ReadOptions, arrow_at
 from pipeline.io.crs import vertical_unit_of
 from pipeline.ruler.evaluation.reading import read_models
 from pipeline.runtime.manifest_reading import read_manifest
-from pipeline.runtime.plan import make_plan
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.resources import SERIAL
 from pipeline.runtime.run import run
+from pipeline.runtime.run_plan import make_plan
 from pipeline.settings import RunSettings
 
 FOOT_M = 1200.0 / 3937.0

@@ -12,11 +12,11 @@ import shapely
 
 from pipeline.errors import InputError
 from pipeline.io import ReadOptions
-from pipeline.runtime.plan import Plan, check_windows, make_plan, split_grid
+from pipeline.runtime.run_plan import Plan, check_windows, make_plan, split_grid
 from pipeline.runtime.stages import split
 from pipeline.runtime.stages.split import Split, SplitTask, split_window
 from pipeline.settings import RunSettings
-from pipeline.terrain.settings import ClassesInUse, SceneSettings
+from pipeline.terrain.terrain_settings import ClassesInUse, SceneSettings
 from pipeline.tiling import MM, Tile, TileGrid
 
 TRUSTED = ClassesInUse(ground=True, building=True)

@@ -23,10 +23,10 @@ from pipeline.runtime.cluster.serial_executor import SerialExecutor
 from pipeline.runtime.digest import run_digest
 from pipeline.runtime.monitoring.measurement import Measured
 from pipeline.runtime.monitoring.progress import Event
-from pipeline.runtime.plan import tiles_per_block
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.resources import Resources
 from pipeline.runtime.run import RunSummary, run
+from pipeline.runtime.run_plan import tiles_per_block
 from pipeline.runtime.scratch.work_folder import is_at_work, locked_work
 from pipeline.settings import RunSettings
 from pipeline.tiling import MM, Tile

@@ -11,7 +11,7 @@ from whole_scene import seen_m, split_alone
 from pipeline.scene import WindowPoints, lattice_of, terrain_of
 from pipeline.settings import RunSettings
 from pipeline.terrain.lattice import NO_DATA, height_above
-from pipeline.terrain.settings import (
+from pipeline.terrain.terrain_settings import (
     ClassesInUse,
     GroundSettings,
     OutlierSettings,

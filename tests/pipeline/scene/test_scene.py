@@ -20,7 +20,8 @@ from pipeline.terrain.decks_and_vehicles import shape_figures
 from pipeline.terrain.facets import FacetKind
 from pipeline.terrain.fragment_sums import Sum
 from pipeline.terrain.lattice import NO_DATA
-from pipeline.terrain.settings import (
+from pipeline.terrain.surfaces import Fragments
+from pipeline.terrain.terrain_settings import (
     CandidateSettings,
     ClassesInUse,
     GroundSettings,
@@ -29,7 +30,6 @@ from pipeline.terrain.settings import (
     SurfaceSettings,
     VegetationSettings,
 )
-from pipeline.terrain.surfaces import Fragments
 from pipeline.tiling import Tile, TileGrid, Window
 
 GROUND, TREE, BUILDING = 2, 5, 6

@@ -9,7 +9,7 @@ from pipeline.geometry import nearest_neighbours
 from pipeline.model import FloatArray, IntArray, LabelArray
 from pipeline.segmentation.plane_merge import merge_planes, parallel_pairs_in_reach
 from pipeline.segmentation.plane_regression import best_fit_plane, cluster_sums
-from pipeline.segmentation.point_assignment import touching_pairs
+from pipeline.segmentation.point_votes import touching_pairs
 
 ALWAYS = 10**9
 

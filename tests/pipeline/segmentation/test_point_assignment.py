@@ -8,7 +8,7 @@ import pytest
 from pipeline.geometry import nearest_neighbours
 from pipeline.model import BoolArray, FloatArray, LabelArray
 from pipeline.segmentation.plane_refinement import nearest_plane
-from pipeline.segmentation.point_assignment import (
+from pipeline.segmentation.point_votes import (
     dissolve_redundant,
     distance_to_plane,
     touching_pairs,

@@ -9,8 +9,8 @@ import pytest
 from pipeline.terrain.between_walls import between_walls
 from pipeline.terrain.lattice import NO_DATA
 from pipeline.terrain.morphological import morphological_ground
-from pipeline.terrain.settings import GroundSettings
-from pipeline.terrain.support import between_walls_support_m
+from pipeline.terrain.reach import between_walls_support_m
+from pipeline.terrain.terrain_settings import GroundSettings
 
 Grid = npt.NDArray[np.int32]
 Mask = npt.NDArray[np.bool_]

@@ -22,7 +22,7 @@ from pipeline.terrain.candidates import (
 )
 from pipeline.terrain.facets import FacetKind
 from pipeline.terrain.fragment_sums import MOMENTS, N_SUMS, Sum
-from pipeline.terrain.settings import CandidateSettings
+from pipeline.terrain.terrain_settings import CandidateSettings
 
 SETTINGS = CandidateSettings()
 

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from pipeline.model import FloatArray, IntArray
 from pipeline.terrain.curved_surfaces import _distances_from_quadric
-from pipeline.terrain.settings import UnitSettings
-from pipeline.terrain.units import units_of
+from pipeline.terrain.terrain_settings import UnitSettings
+from pipeline.terrain.unit_division import units_of
 
 SETTINGS = UnitSettings()
 SHAPES = ("barrel", "cap", "cone", "ellipsoid", "hemisphere")

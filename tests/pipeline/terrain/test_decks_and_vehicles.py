@@ -11,8 +11,8 @@ from pipeline.terrain.decks_and_vehicles import shape_figures
 from pipeline.terrain.facets import FacetKind, SceneVertices, VertexKind
 from pipeline.terrain.fragment_sums import Sum
 from pipeline.terrain.point_assignment import ScenePoints
-from pipeline.terrain.settings import CandidateSettings, SurfaceSettings
 from pipeline.terrain.surfaces import fragments_of
+from pipeline.terrain.terrain_settings import CandidateSettings, SurfaceSettings
 from pipeline.tin.delaunay import triangulate
 
 Elevation = Callable[[FloatArray, FloatArray], FloatArray]

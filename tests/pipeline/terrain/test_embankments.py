@@ -12,8 +12,8 @@ from pipeline.terrain import morphological
 from pipeline.terrain.embankments import embankments
 from pipeline.terrain.lattice import NO_DATA
 from pipeline.terrain.morphological import morphological_ground
-from pipeline.terrain.settings import GroundSettings
-from pipeline.terrain.support import BLOCK_CELLS, LINK_CELLS, embankments_support_m
+from pipeline.terrain.reach import BLOCK_CELLS, LINK_CELLS, embankments_support_m
+from pipeline.terrain.terrain_settings import GroundSettings
 
 Grid = npt.NDArray[np.int32]
 Mask = npt.NDArray[np.bool_]

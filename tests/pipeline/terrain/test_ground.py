@@ -15,8 +15,8 @@ from pipeline.terrain import ground
 from pipeline.terrain.ground import Terrain, ground_of, ground_on, ground_points, slopes_of
 from pipeline.terrain.lattice import CELL_MM, NO_DATA, height_above, lowest_per_cell
 from pipeline.terrain.pits import without_pits
-from pipeline.terrain.settings import GroundSettings
-from pipeline.terrain.support import CLUMP_CELLS, GAP_CELLS, PIT_CELLS
+from pipeline.terrain.reach import CLUMP_CELLS, GAP_CELLS, PIT_CELLS
+from pipeline.terrain.terrain_settings import GroundSettings
 
 Grid = npt.NDArray[np.int32]
 Points = npt.NDArray[np.int64]

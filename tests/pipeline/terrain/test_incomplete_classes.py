@@ -5,7 +5,7 @@ import numpy.typing as npt
 
 from pipeline.model import IntArray, KindArray
 from pipeline.terrain.incomplete_classes import OnRoof, undecided_on_roofs
-from pipeline.terrain.settings import VegetationSettings
+from pipeline.terrain.terrain_settings import VegetationSettings
 
 
 def judged(xyz_mm: IntArray, building: npt.NDArray[np.bool_]) -> KindArray:

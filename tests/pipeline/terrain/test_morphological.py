@@ -14,7 +14,7 @@ from pipeline.terrain.lattice import NO_DATA
 from pipeline.terrain.morphological import closed_gaps, leaning_planes, morphological_ground, regrown, without_clumps
 from pipeline.terrain.openings import cut_off, dilate_back, erode_once, framed
 from pipeline.terrain.rejoining import rejoined
-from pipeline.terrain.settings import GroundSettings
+from pipeline.terrain.terrain_settings import GroundSettings
 from pipeline.terrain.wide_objects import wide_objects, with_corners
 
 Grid = npt.NDArray[np.int32]

@@ -11,8 +11,8 @@ from pipeline.model import BoolArray, IntArray, Tin
 from pipeline.terrain.facets import SceneVertices, VertexKind
 from pipeline.terrain.needed_ground import needed_vertices
 from pipeline.terrain.point_assignment import ScenePoints
-from pipeline.terrain.settings import SurfaceSettings
 from pipeline.terrain.surfaces import fragments_of
+from pipeline.terrain.terrain_settings import SurfaceSettings
 from pipeline.tin.delaunay import triangulate
 
 SIDE_MM = 60_000

@@ -12,7 +12,7 @@ from pipeline.errors import SettingsError
 from pipeline.model import BoolArray
 from pipeline.terrain import outliers as outliers_module
 from pipeline.terrain.outliers import dense_enough
-from pipeline.terrain.settings import OutlierSettings
+from pipeline.terrain.terrain_settings import OutlierSettings
 
 Points = npt.NDArray[np.int64]
 

@@ -26,8 +26,8 @@ from pipeline.terrain.facets import (
 )
 from pipeline.terrain.fragment_sums import N_SUMS, Sum
 from pipeline.terrain.point_assignment import Allowed, ScenePoints
-from pipeline.terrain.settings import SurfaceSettings
 from pipeline.terrain.surfaces import Fragments, fragments_of
+from pipeline.terrain.terrain_settings import SurfaceSettings
 from pipeline.tin.delaunay import triangulate
 
 Height = Callable[[FloatArray, FloatArray], FloatArray]

@@ -5,9 +5,9 @@ import numpy.typing as npt
 import pytest
 
 from pipeline.terrain.flight_passes import SLICE_S, Strip, ids_of, ids_of_timed, passes_of, slices_of, united_slices
-from pipeline.terrain.settings import StripSettings
 from pipeline.terrain.strip_moves import moves_of, offsets_of, strips_warning, surfaces_warning
 from pipeline.terrain.survey_strips import Rows, compared_strips, counted
+from pipeline.terrain.terrain_settings import StripSettings
 from pipeline.tiling import Window
 
 SETTINGS = StripSettings()

@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
-from pipeline.terrain.settings import UnitSettings
-from pipeline.terrain.units import units_of
+from pipeline.terrain.terrain_settings import UnitSettings
+from pipeline.terrain.unit_division import units_of
 
 SETTINGS = UnitSettings()
 STEEP = math.tan(math.radians(40.0))

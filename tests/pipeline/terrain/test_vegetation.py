@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from pipeline.kernels.normal_equations import smallest_eigenvalue
 from pipeline.model import KindArray
-from pipeline.terrain.settings import VegetationSettings
+from pipeline.terrain.terrain_settings import VegetationSettings
 from pipeline.terrain.vegetation import _is_planar, crowns, planarity
 
 Points = npt.NDArray[np.int64]

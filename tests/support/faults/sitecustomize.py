@@ -48,8 +48,8 @@ FAULTS: dict[str, Any] = json.loads(os.environ.get("GABLEWORK_FAULTS", "{}"))
 
 STAGES = {
     "pipeline.runtime.stages.ingest": ("ingest_file", "ingest"),
-    "pipeline.runtime.stages.cells": ("find_cells", "cells"),
-    "pipeline.runtime.stages.ground": ("draw_ground", "ground"),
+    "pipeline.runtime.stages.cells_stage": ("find_cells", "cells"),
+    "pipeline.runtime.stages.ground_stage": ("draw_ground", "ground"),
     "pipeline.runtime.stages.split": ("split_window", "split"),
     "pipeline.runtime.stages.reconstruct": ("model_batch", "reconstruct"),
     "pipeline.runtime.stages.publish": ("publish_tile", "publish"),

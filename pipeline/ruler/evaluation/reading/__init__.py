@@ -9,10 +9,10 @@ from pathlib import Path
 from pipeline.errors import InputError
 from pipeline.io import is_url, shown
 from pipeline.ruler.evaluation.models import ModelSet
-from pipeline.ruler.evaluation.reading.cityjson import is_cityjson, read_cityjson_files, read_cityjsonseq_files
+from pipeline.ruler.evaluation.reading.cityjson_models import is_cityjson, read_cityjson_files, read_cityjsonseq_files
 from pipeline.ruler.evaluation.reading.collected import Collected, Kind
-from pipeline.ruler.evaluation.reading.obj import read_obj_files
-from pipeline.ruler.evaluation.reading.run import is_run, read_run
+from pipeline.ruler.evaluation.reading.obj_models import read_obj_files
+from pipeline.ruler.evaluation.reading.run_models import is_run, read_run
 
 CITYJSON = (".city.json", ".json")
 CITYJSONSEQ = (".city.jsonl", ".jsonl")

@@ -10,7 +10,7 @@ from shapely import Polygon
 
 from pipeline.model import RoofType, Status
 from pipeline.ruler.evaluation.models import ModelSet, RoofModel
-from pipeline.ruler.evaluation.reading.surfaces import Assembled
+from pipeline.ruler.evaluation.reading.model_surfaces import Assembled
 
 Kind = Literal["run", "cityjson", "cityjsonseq", "obj"]
 

@@ -21,7 +21,7 @@ from pipeline.extras.classify.point_classes import (
     tops_nearby,
 )
 from pipeline.terrain.lattice import NO_DATA
-from pipeline.terrain.settings import VegetationSettings
+from pipeline.terrain.terrain_settings import VegetationSettings
 
 
 @pytest.fixture

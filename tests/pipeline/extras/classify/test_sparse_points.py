@@ -16,7 +16,7 @@ from pipeline.extras.classify.sparse_points import (
     likely_building,
     terms_of,
 )
-from pipeline.terrain.settings import VegetationSettings
+from pipeline.terrain.terrain_settings import VegetationSettings
 
 
 def random_points(seed: int = 4) -> SparsePoints:

@@ -17,7 +17,7 @@ from pipeline.methods import ReconstructSettings
 from pipeline.model import Candidate, GivenHeights, GroundSource, HeightSource, Reason, Status
 from pipeline.quality.validity import check_solid
 from pipeline.recipe import reconstruct_building
-from pipeline.roof.settings import FootprintSettings
+from pipeline.roof.roof_settings import FootprintSettings
 
 NAMED = FootprintSettings(height="h", roof_elevation="roof", storeys="n", ground_elevation="ground")
 LACK = BuildingError(Reason.TOO_FEW_POINTS, "2 roof points")

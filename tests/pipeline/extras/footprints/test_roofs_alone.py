@@ -9,7 +9,7 @@ import shapely
 from pipeline.extras.footprints.roofs_alone import SUPPORT_CELLS, roofs_alone
 from pipeline.model import BoolArray
 from pipeline.terrain.lattice import NO_DATA, Elevations
-from pipeline.terrain.support import ROOFS_ALONE_CELLS
+from pipeline.terrain.reach import ROOFS_ALONE_CELLS
 
 SIDE = 420
 

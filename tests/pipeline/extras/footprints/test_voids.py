@@ -8,7 +8,7 @@ from shapely import MultiPolygon
 from pipeline.extras.footprints.voids import without_voids
 from pipeline.model import FloatArray
 from pipeline.roof.footprint_in_mm import footprint_in_mm
-from pipeline.roof.settings import RoofSettings
+from pipeline.roof.roof_settings import RoofSettings
 
 SETTINGS = RoofSettings()
 TURN = 23.0

@@ -6,7 +6,7 @@ from shapely import MultiPolygon
 
 from pipeline.extras.guides.enclosed_planes import with_enclosed_planes
 from pipeline.model import FloatArray
-from pipeline.roof.settings import ArrangementSettings
+from pipeline.roof.roof_settings import ArrangementSettings
 
 HOUSE_MM = MultiPolygon([shapely.box(0, 0, 10_000, 6_000)])
 LEFT = (0.5, 0.0, 5.0)

@@ -22,7 +22,7 @@ from pipeline.roof.arrangement.candidate_lines import CandidateLines
 from pipeline.roof.arrangement.guide_lines import NO_GUIDES, Guides, with_guides
 from pipeline.roof.footprint_in_mm import footprint_in_mm
 from pipeline.roof.partition import RoofPartition
-from pipeline.roof.settings import ArrangementSettings
+from pipeline.roof.roof_settings import ArrangementSettings
 
 SETTINGS = ArrangementSettings()
 HOUSE = shapely.box(0.0, 0.0, 10.0, 8.0)

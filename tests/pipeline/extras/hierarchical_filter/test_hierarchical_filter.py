@@ -15,7 +15,7 @@ from pipeline.terrain.ground import Terrain, ground_of
 from pipeline.terrain.lattice import NO_DATA
 from pipeline.terrain.pits import without_pits
 from pipeline.terrain.planar_fitting import plane_around, plane_sums
-from pipeline.terrain.settings import GroundSettings
+from pipeline.terrain.terrain_settings import GroundSettings
 
 Grid = npt.NDArray[np.int32]
 Mask = npt.NDArray[np.bool_]

@@ -21,7 +21,7 @@ from candidates_by_hand import (
 
 from pipeline.errors import BuildingError, SettingsError
 from pipeline.extras.papers import fuzzy_sart
-from pipeline.extras.papers.settings import FuzzySartSettings
+from pipeline.extras.papers.paper_settings import FuzzySartSettings
 from pipeline.model import Candidate, FloatArray, Reason, Segmentation
 from pipeline.prepared_cloud import prepare_cloud
 

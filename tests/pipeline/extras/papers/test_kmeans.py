@@ -16,7 +16,7 @@ from checkout import ROOT
 from pipeline.errors import BuildingError, SettingsError
 from pipeline.extras.papers import kmeans
 from pipeline.extras.papers.kmeans import building_top, cluster_facets
-from pipeline.extras.papers.settings import KMeansSettings
+from pipeline.extras.papers.paper_settings import KMeansSettings
 from pipeline.methods import METHODS, ReconstructSettings
 from pipeline.model import BuildingResult, Candidate, FloatArray, Reason, RoofType, Segmentation, Status
 from pipeline.prepared_cloud import prepare_cloud

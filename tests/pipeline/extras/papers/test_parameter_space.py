@@ -13,8 +13,8 @@ from candidates_by_hand import TURNS, Matrix, candidate, moved, strewn, turned
 from checkout import ROOT
 
 from pipeline.errors import BuildingError, SettingsError
+from pipeline.extras.papers.paper_settings import ParameterSpace2dSettings, ParameterSpace3dSettings
 from pipeline.extras.papers.parameter_space import segment_2d, segment_3d
-from pipeline.extras.papers.settings import ParameterSpace2dSettings, ParameterSpace3dSettings
 from pipeline.methods import METHODS
 from pipeline.model import Candidate, FloatArray, Reason, RoofType, Segmentation
 from pipeline.prepared_cloud import prepare_cloud

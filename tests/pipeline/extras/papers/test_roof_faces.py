@@ -8,7 +8,7 @@ import shapely
 from candidates_by_hand import candidate
 
 from pipeline.errors import SettingsError
-from pipeline.extras.papers.settings import RoofFaceSettings
+from pipeline.extras.papers.paper_settings import RoofFaceSettings
 from pipeline.methods import METHODS, ReconstructSettings, method_named
 from pipeline.model import BuildingResult, Candidate, RoofType, Status
 from pipeline.recipe import reconstruct_building

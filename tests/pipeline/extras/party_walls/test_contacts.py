@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.extras.party_walls.contacts import Contacts, Walls, contacts, wall_areas
-from pipeline.extras.party_walls.settings import PartyWallSettings
+from pipeline.extras.party_walls.party_wall_settings import PartyWallSettings
 
 Wall = shapely.Polygon
 Ring = Sequence[tuple[float, float]]

@@ -19,7 +19,7 @@ from typer.testing import CliRunner
 
 from pipeline.errors import RunError
 from pipeline.export.geoparquet import read_table
-from pipeline.export.records import RecordContext
+from pipeline.export.record_rows import RecordContext
 from pipeline.export.tile import write_tile
 from pipeline.extras.publish.selection import run_of, select_run
 from pipeline.io import storage_at

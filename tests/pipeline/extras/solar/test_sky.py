@@ -14,8 +14,8 @@ from pipeline.extras.solar.figures import figures
 from pipeline.extras.solar.horizon import horizons, obstacles_of
 from pipeline.extras.solar.roof_planes import LIFT_M, RoofPlanes
 from pipeline.extras.solar.sectors import SECTOR_RAD, SECTORS
-from pipeline.extras.solar.settings import SolarSettings
 from pipeline.extras.solar.sky_view import sky_views
+from pipeline.extras.solar.solar_settings import SolarSettings
 from pipeline.model import FloatArray
 
 AZIMUTHS = np.arange(SECTORS) * SECTOR_RAD

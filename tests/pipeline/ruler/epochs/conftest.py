@@ -8,7 +8,7 @@ import pytest
 from epochs_by_hand import by_name, compared, write_epoch
 
 from pipeline.model import BuildingResult
-from pipeline.ruler.epochs.settings import DiffSettings
+from pipeline.ruler.epochs.epoch_settings import DiffSettings
 
 Compare = Callable[..., dict[str, dict[str, Any]]]
 

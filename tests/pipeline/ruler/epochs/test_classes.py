@@ -9,7 +9,7 @@ import pytest
 from epochs_by_hand import ORIGIN, failed, house, rejected
 
 from pipeline.model import BuildingResult, Reason, Status
-from pipeline.ruler.epochs.settings import DiffSettings
+from pipeline.ruler.epochs.epoch_settings import DiffSettings
 from pipeline.ruler.simulation.roofs import RoofShape
 from pipeline.runtime.manifest import RunStatus
 

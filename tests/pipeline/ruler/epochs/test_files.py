@@ -19,9 +19,9 @@ from typer.testing import CliRunner
 from pipeline.errors import CrsError, RunError, SettingsError
 from pipeline.io import storage_at
 from pipeline.io.crs_units import with_vertical_unit
+from pipeline.ruler.epochs.change_records import CHANGES, COLUMNS, DOUBTS, INCOMPARABLE, RELATIONS, Change
 from pipeline.ruler.epochs.diff import DiffRequest, diff
-from pipeline.ruler.epochs.records import CHANGES, COLUMNS, DOUBTS, INCOMPARABLE, RELATIONS, Change
-from pipeline.ruler.epochs.settings import DiffSettings, read_settings
+from pipeline.ruler.epochs.epoch_settings import DiffSettings, read_settings
 from pipeline.runtime.manifest import RunStatus
 
 

@@ -9,7 +9,8 @@ import shapely
 from epochs_by_hand import ORIGIN, by_name, compared, failed, house, write_epoch
 
 from pipeline.model import BuildingResult
-from pipeline.ruler.epochs import comparing, matching
+from pipeline.ruler.epochs import epoch_comparison as comparing
+from pipeline.ruler.epochs import epoch_matching as matching
 from pipeline.ruler.simulation.roofs import RoofShape
 
 MIRRORED = {

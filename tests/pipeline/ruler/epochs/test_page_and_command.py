@@ -16,8 +16,8 @@ from typer.testing import CliRunner
 from pipeline.console import ExitCode
 from pipeline.report import class_map
 from pipeline.report.class_map import ClassMap
+from pipeline.ruler.epochs.change_records import SCHEMA, Change
 from pipeline.ruler.epochs.diff import Diff, DiffRequest, diff
-from pipeline.ruler.epochs.records import SCHEMA, Change
 from pipeline.ruler.report.epochs_map import COLOURS, epochs_map, gathering
 from pipeline.ruler.report.epochs_page import page
 

@@ -8,7 +8,7 @@ import shapely
 from roofs_by_hand import conditions, lifted, points_of, reference
 
 from pipeline.model import RoofType
-from pipeline.ruler.evaluation.blocks import BLOCK_SHAPE, joined_reference
+from pipeline.ruler.evaluation.block_scores import BLOCK_SHAPE, joined_reference
 from pipeline.ruler.evaluation.models import RoofModel, RoofSurface
 from pipeline.ruler.evaluation.reference import ReferencePoints
 

@@ -8,8 +8,8 @@ import roofs_by_hand as by_hand
 from roofs_by_hand import flat, gable, hip, reference
 
 from pipeline.model import Status
+from pipeline.ruler.evaluation.building_matching import match_footprints
 from pipeline.ruler.evaluation.delivery import Delivered, Stands, measures, record_measures, score_delivery
-from pipeline.ruler.evaluation.matching import match_footprints
 from pipeline.ruler.evaluation.models import ModelSet, RoofModel
 from pipeline.ruler.evaluation.reference import Reference
 from pipeline.ruler.evaluation.subsets import subsets

@@ -19,7 +19,7 @@ from pipeline.ruler.evaluation.building_raster import (
     PointRaster,
     outlines_of,
 )
-from pipeline.ruler.evaluation.detection import DEFINITIONS, Detection, detect, detection_measures
+from pipeline.ruler.evaluation.detection_scores import DEFINITIONS, Detection, detect, detection_measures
 from pipeline.ruler.evaluation.measure import Measure
 from pipeline.ruler.evaluation.models import RoofModel
 from pipeline.ruler.evaluation.reference import Reference, ReferencePoints

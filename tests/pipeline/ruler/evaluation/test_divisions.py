@@ -14,7 +14,7 @@ from pipeline.ruler.evaluation.delivery import Stands
 from pipeline.ruler.evaluation.divisions import MIN_PART_IOU, whole_models
 from pipeline.ruler.evaluation.evaluate import Evaluation, evaluate
 from pipeline.ruler.evaluation.models import RoofModel
-from pipeline.ruler.evaluation.tables import ROLES
+from pipeline.ruler.evaluation.score_tables import ROLES
 
 WALLS = (0.0, 6.0, 12.0, 18.0, 24.0)
 DEPTH_M = 8.0

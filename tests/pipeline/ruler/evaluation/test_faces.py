@@ -24,7 +24,7 @@ from roofs_by_hand import (
 )
 
 from pipeline.model import RoofType
-from pipeline.ruler.evaluation.faces import DEFINITIONS, FaceScore, FaceVerdict, measures, score_faces
+from pipeline.ruler.evaluation.face_scores import DEFINITIONS, FaceScore, FaceVerdict, measures, score_faces
 from pipeline.ruler.evaluation.models import RoofModel
 from pipeline.ruler.evaluation.reference import Reference
 from pipeline.ruler.evaluation.subsets import subsets

@@ -9,8 +9,8 @@ import roofs_by_hand as by_hand
 import shapely
 from roofs_by_hand import flat, gable, hip, reference, shrunk
 
+from pipeline.ruler.evaluation.building_matching import match_footprints
 from pipeline.ruler.evaluation.footprints import measures, score_footprints
-from pipeline.ruler.evaluation.matching import match_footprints
 from pipeline.ruler.evaluation.models import RoofModel
 from pipeline.ruler.evaluation.reference import Reference
 from pipeline.ruler.evaluation.subsets import Columns, subsets

@@ -15,8 +15,8 @@ from scipy import stats
 
 from pipeline.errors import InconsistentInputError
 from pipeline.model import BoolArray, FloatArray
-from pipeline.ruler.evaluation import ground
-from pipeline.ruler.evaluation.ground import (
+from pipeline.ruler.evaluation import ground_scores as ground
+from pipeline.ruler.evaluation.ground_scores import (
     DEFINITIONS,
     GroundOfFiles,
     GroundOfRun,
@@ -30,7 +30,7 @@ from pipeline.ruler.evaluation.reference_points import read_points_reference
 from pipeline.ruler.evaluation.subsets import Columns, subsets
 from pipeline.scene import WindowPoints, terrain_of
 from pipeline.terrain.ground import ground_points
-from pipeline.terrain.settings import ClassesInUse, SceneSettings
+from pipeline.terrain.terrain_settings import ClassesInUse, SceneSettings
 from pipeline.tiling import Window
 
 SETTINGS = SceneSettings()

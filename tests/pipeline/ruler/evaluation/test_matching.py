@@ -9,7 +9,7 @@ import shapely
 from roofs_by_hand import gable, reference
 
 from pipeline.model import RoofType
-from pipeline.ruler.evaluation.matching import match_footprints, one_to_one, sound_polygons
+from pipeline.ruler.evaluation.building_matching import match_footprints, one_to_one, sound_polygons
 from pipeline.ruler.evaluation.models import RoofModel
 from pipeline.ruler.evaluation.subsets import subsets, summed_over_units
 

@@ -14,7 +14,7 @@ from pipeline.errors import CrsError, InputError
 from pipeline.model import FaceKind, RoofType, Status
 from pipeline.ruler.evaluation.models import ModelSet
 from pipeline.ruler.evaluation.reading import read_models
-from pipeline.ruler.evaluation.reading.cityjson import features
+from pipeline.ruler.evaluation.reading.cityjson_models import features
 from pipeline.ruler.evaluation.reading.collected import Collected
 
 SQUARE = [[0, 0], [8, 0], [8, 6], [0, 6]]

@@ -8,7 +8,7 @@ import pytest
 import shapely
 from model_files import small
 
-from pipeline.export.records import RecordContext
+from pipeline.export.record_rows import RecordContext
 from pipeline.export.tile import write_tile
 from pipeline.model import BuildingResult, RoofType, Status
 from pipeline.quality.validity import check_solid

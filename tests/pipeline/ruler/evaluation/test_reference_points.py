@@ -14,8 +14,8 @@ from las_files import write_las
 from pipeline.errors import InconsistentInputError, InputError, SettingsError
 from pipeline.io import ReadOptions
 from pipeline.model import FloatArray
-from pipeline.ruler.evaluation.detection import detect, detection_measures
-from pipeline.ruler.evaluation.ground import ground_blocks
+from pipeline.ruler.evaluation.detection_scores import detect, detection_measures
+from pipeline.ruler.evaluation.ground_scores import ground_blocks
 from pipeline.ruler.evaluation.reference_points import read_points_reference
 from pipeline.ruler.evaluation.subsets import subsets
 

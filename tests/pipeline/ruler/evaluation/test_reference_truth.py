@@ -16,7 +16,7 @@ from pipeline.errors import InconsistentInputError, InputError
 from pipeline.ruler.evaluation.reading import read_models
 from pipeline.ruler.evaluation.reference import Reference
 from pipeline.ruler.evaluation.reference_truth import read_truth_reference
-from pipeline.ruler.evaluation.residuals import building_residuals
+from pipeline.ruler.evaluation.residual_scores import building_residuals
 from pipeline.ruler.simulation.dataset import simulate
 
 

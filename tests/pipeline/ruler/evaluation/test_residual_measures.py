@@ -15,7 +15,7 @@ from pipeline.model import FloatArray, LabelArray, RoofType
 from pipeline.ruler.evaluation.measure import Measure
 from pipeline.ruler.evaluation.models import RoofModel, RoofSurface
 from pipeline.ruler.evaluation.reference import Reference, ReferencePoints
-from pipeline.ruler.evaluation.residuals import (
+from pipeline.ruler.evaluation.residual_scores import (
     DEFINITIONS,
     EDGES_M,
     Residuals,

@@ -9,8 +9,8 @@ import roofs_by_hand as by_hand
 from roofs_by_hand import flat, gable, hip, lifted, reference, turned, with_face
 
 from pipeline.model import RoofType
-from pipeline.ruler.evaluation.faces import score_faces
-from pipeline.ruler.evaluation.matching import match_footprints
+from pipeline.ruler.evaluation.building_matching import match_footprints
+from pipeline.ruler.evaluation.face_scores import score_faces
 from pipeline.ruler.evaluation.models import RoofModel
 from pipeline.ruler.evaluation.reference import Reference
 from pipeline.ruler.evaluation.roof_types import (

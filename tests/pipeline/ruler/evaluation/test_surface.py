@@ -10,7 +10,7 @@ import roofs_by_hand as by_hand
 import shapely
 from roofs_by_hand import flat, gable, hip, lifted, moved, reference, shrunk, with_face
 
-from pipeline.ruler.evaluation import residuals
+from pipeline.ruler.evaluation import residual_scores as residuals
 from pipeline.ruler.evaluation.models import RoofModel
 from pipeline.ruler.evaluation.reference import Reference
 from pipeline.ruler.evaluation.subsets import subsets

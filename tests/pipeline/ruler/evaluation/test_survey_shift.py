@@ -11,7 +11,7 @@ import shapely
 
 from pipeline.errors import InputError, SettingsError
 from pipeline.ruler.evaluation.evaluate import evaluate
-from pipeline.ruler.evaluation.files import EvaluationRequest
+from pipeline.ruler.evaluation.evaluate_files import EvaluationRequest
 from pipeline.ruler.evaluation.reading import read_models
 from pipeline.ruler.evaluation.reference_truth import read_truth_reference
 from pipeline.ruler.evaluation.survey_shift import mean_shifts

@@ -11,7 +11,7 @@ from pipeline.model import Solid
 from pipeline.quality.validity import ValidityTolerances
 from pipeline.ruler.evaluation.models import ModelSet, RoofModel
 from pipeline.ruler.evaluation.reading import read_models
-from pipeline.ruler.evaluation.validity import DEFINITIONS, code_counts, measures, validity
+from pipeline.ruler.evaluation.validity_scores import DEFINITIONS, code_counts, measures, validity
 
 
 @pytest.fixture(scope="module")

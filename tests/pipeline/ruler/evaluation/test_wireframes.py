@@ -20,9 +20,9 @@ from pipeline.ruler.evaluation.chapters import chapters
 from pipeline.ruler.evaluation.evaluate import Evaluation, evaluate
 from pipeline.ruler.evaluation.measure import Group
 from pipeline.ruler.evaluation.models import ModelSet, RoofModel
-from pipeline.ruler.evaluation.reading.wireframes import Wireframe, WireframeSet, read_wireframes
+from pipeline.ruler.evaluation.reading.wireframe_files import Wireframe, WireframeSet, read_wireframes
 from pipeline.ruler.evaluation.wireframe_network import drawn_segments, network, roof_segments
-from pipeline.ruler.evaluation.wireframes import matched_corners, score_wireframes
+from pipeline.ruler.evaluation.wireframe_scores import matched_corners, score_wireframes
 
 Ends = list[tuple[int, int]]
 SQUARE: Ends = [(0, 1), (1, 2), (2, 3), (3, 0)]

@@ -14,10 +14,10 @@ from damaged_suburb import KINDS, damaged_evaluation
 
 from pipeline.errors import RunError
 from pipeline.ruler.evaluation.chapters import chapters, printed
-from pipeline.ruler.evaluation.counts import breakdowns, count_tables
+from pipeline.ruler.evaluation.counted_models import breakdowns, count_tables
 from pipeline.ruler.evaluation.definitions import DEFINITIONS
+from pipeline.ruler.evaluation.evaluation_writing import markdown, measures_table, write_tables
 from pipeline.ruler.evaluation.measure import Group, Measure
-from pipeline.ruler.evaluation.writing import markdown, measures_table, write_tables
 
 
 def measure(value: float, low: float = math.nan, high: float = math.nan, name: str = "delivery.lod2") -> Measure:

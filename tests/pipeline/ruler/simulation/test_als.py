@@ -11,7 +11,7 @@ from pipeline.errors import SettingsError
 from pipeline.model import FloatArray, PointCloud
 from pipeline.ruler.simulation.als import ScanBlock, ScannerSettings, scan, scan_all, strip_count
 from pipeline.ruler.simulation.roofs import RoofDimensions, RoofShape
-from pipeline.ruler.simulation.scene import Scene, Terrain
+from pipeline.ruler.simulation.simulated_scene import Scene, Terrain
 from pipeline.ruler.simulation.suites import SUITES, single_building
 
 PLAIN = ScannerSettings(strip_overlap=0.0, strip_spacing_m=100.0, drop_out=0.0)

@@ -19,7 +19,7 @@ from pipeline.ruler.evaluation.reading import read_models
 from pipeline.ruler.simulation.als import ScanBlock, scan_all
 from pipeline.ruler.simulation.city import CITY_SCANNER, CityPlan, city
 from pipeline.ruler.simulation.dataset import ScenePaths, simulate, tile_extents
-from pipeline.ruler.simulation.scene import Defect, Scene
+from pipeline.ruler.simulation.simulated_scene import Defect, Scene
 from pipeline.ruler.simulation.strips import reached
 from pipeline.ruler.simulation.suites import SUITES
 from pipeline.ruler.simulation.truth_files import write_models

@@ -7,8 +7,8 @@ import pytest
 from simulated import hits_of_lines, scene_on, top_surface
 
 from pipeline.ruler.simulation.first_hit import GROUND, ROOF, TREE, WALL, mixed_bits, uniform_of
-from pipeline.ruler.simulation.scene import Scene, Terrain, Tree
 from pipeline.ruler.simulation.scene_arrays import scene_arrays
+from pipeline.ruler.simulation.simulated_scene import Scene, Terrain, Tree
 from pipeline.ruler.simulation.suites import SUITES
 
 SUBURB = SUITES["suburb"].make(2, (120.0, 120.0))

@@ -11,7 +11,7 @@ from pipeline.ruler.simulation.bridges_and_vans import (
     VAN_WIDTH_M,
     bridges_and_vans,
 )
-from pipeline.ruler.simulation.scene import Scene
+from pipeline.ruler.simulation.simulated_scene import Scene
 from pipeline.ruler.simulation.wide_halls import HALL_M, wide_halls
 
 

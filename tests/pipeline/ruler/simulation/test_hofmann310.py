@@ -17,7 +17,7 @@ from pipeline.ruler.simulation.als import scan_all
 from pipeline.ruler.simulation.dataset import ScenePaths, simulate
 from pipeline.ruler.simulation.hofmann310 import SCANNER, hofmann310
 from pipeline.ruler.simulation.roofs import RoofShape
-from pipeline.ruler.simulation.scene import Defect, FaultKind, Scene
+from pipeline.ruler.simulation.simulated_scene import Defect, FaultKind, Scene
 
 SURVEY_DEFECTS = {Defect.STRIP_SHIFT, Defect.WRONG_ROWS}
 

@@ -18,8 +18,8 @@ from pipeline.ruler.simulation.als import ScannerSettings, scan_all
 from pipeline.ruler.simulation.first_hit import ROOF, WALL
 from pipeline.ruler.simulation.random_dimensions import random_dimensions
 from pipeline.ruler.simulation.roofs import RoofDimensions, RoofShape
-from pipeline.ruler.simulation.scene import Building, Scene, Terrain, undulating_terrain
 from pipeline.ruler.simulation.scene_arrays import scene_arrays
+from pipeline.ruler.simulation.simulated_scene import Building, Scene, Terrain, undulating_terrain
 from pipeline.ruler.simulation.solids import building_solid
 
 LEAN = 0.45

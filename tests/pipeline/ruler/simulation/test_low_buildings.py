@@ -5,7 +5,7 @@ import pytest
 import shapely
 
 from pipeline.ruler.simulation.low_buildings import AREA_M2, HEIGHT_M, OF_EACH, low_buildings
-from pipeline.ruler.simulation.scene import Scene
+from pipeline.ruler.simulation.simulated_scene import Scene
 
 
 @pytest.fixture(scope="module", params=[1_000, 90_000])

@@ -6,7 +6,7 @@ import shapely
 
 from pipeline.ruler.simulation.plots import PlannedBuilding, packed_plots
 from pipeline.ruler.simulation.roofs import ROOFS, RoofDimensions, RoofShape
-from pipeline.ruler.simulation.scene import turned
+from pipeline.ruler.simulation.simulated_scene import turned
 
 
 def planned(count: int) -> list[PlannedBuilding]:

@@ -9,8 +9,8 @@ import shapely
 from simulated import placed
 
 from pipeline.model import FloatArray
+from pipeline.roof.roof_settings import RoofTypeSettings
 from pipeline.roof.roof_type import roof_type
-from pipeline.roof.settings import RoofTypeSettings
 from pipeline.ruler.simulation.additions import can_have_dormers, plan_rectangle, random_dormers, random_superstructures
 from pipeline.ruler.simulation.random_dimensions import SHORTEST_SIDE_M, random_dimensions
 from pipeline.ruler.simulation.roofs import (

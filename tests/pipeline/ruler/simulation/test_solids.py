@@ -13,7 +13,7 @@ from pipeline.quality.validity import check_solid
 from pipeline.ruler.simulation.additions import random_dormers, random_superstructures
 from pipeline.ruler.simulation.random_dimensions import random_dimensions
 from pipeline.ruler.simulation.roofs import Addition, AdditionKind, RoofDimensions, RoofShape
-from pipeline.ruler.simulation.scene import Building, Terrain, undulating_terrain
+from pipeline.ruler.simulation.simulated_scene import Building, Terrain, undulating_terrain
 from pipeline.ruler.simulation.solids import building_solid, has_steps, truth_record
 from pipeline.ruler.simulation.suites import SUITES
 

@@ -11,8 +11,8 @@ from typer.testing import CliRunner
 
 from pipeline.errors import SettingsError
 from pipeline.ruler.simulation.roofs import RoofShape
-from pipeline.ruler.simulation.scene import Scene
 from pipeline.ruler.simulation.seeds import DRAWS, FIRST_SEEDS, Split, seed_of, split_of
+from pipeline.ruler.simulation.simulated_scene import Scene
 from pipeline.ruler.simulation.suites import SUITES
 
 SMALL = {"town": (150.0, 120.0), "city": (150.0, 100.0)}

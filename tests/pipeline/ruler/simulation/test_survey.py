@@ -9,7 +9,14 @@ from simulated import placed, scene_on
 from pipeline.model import BoolArray, FloatArray
 from pipeline.ruler.simulation.als import ScanBlock, ScannerSettings, joined, reach_m, scan, scan_all, strip_count
 from pipeline.ruler.simulation.roofs import RoofDimensions, RoofShape
-from pipeline.ruler.simulation.scene import FaultKind, Scene, SurveyFault, Terrain, WetSpot, undulating_terrain
+from pipeline.ruler.simulation.simulated_scene import (
+    FaultKind,
+    Scene,
+    SurveyFault,
+    Terrain,
+    WetSpot,
+    undulating_terrain,
+)
 from pipeline.ruler.simulation.strips import flight_lines, lines_over, strip_shifts_m
 from pipeline.ruler.simulation.town import town
 

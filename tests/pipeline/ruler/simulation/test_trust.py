@@ -14,7 +14,7 @@ import shapely
 from pipeline.ruler.evaluation.reading import read_models
 from pipeline.ruler.simulation.als import ScanBlock, scan, scan_all
 from pipeline.ruler.simulation.dataset import simulate
-from pipeline.ruler.simulation.scene import Scene
+from pipeline.ruler.simulation.simulated_scene import Scene
 from pipeline.ruler.simulation.strips import Returns
 from pipeline.ruler.simulation.suites import SUITES
 from pipeline.ruler.simulation.survey_files import recorded
