@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import functools
 import importlib
 from collections.abc import Mapping
 from typing import Any
 
 
-@functools.cache
 def loaded(place: str) -> Any:
     """What a "module:name" names; the module is imported at the first call.
 

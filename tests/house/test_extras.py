@@ -1,5 +1,6 @@
-"""Extras: each is a folder that says what it is, and every name of the table leads to something."""
+"""Extras: each is a folder that says what it is. Modules that are named in texts are there."""
 
+import importlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -7,6 +8,8 @@ import pytest
 
 import pipeline.extras
 from pipeline.registry import EXTRAS, extra
+from pipeline.runtime.cluster.worker_setup import STAGES
+from pipeline.runtime.isolation.preloading import loads_of
 
 FOLDERS = sorted(path for path in Path(pipeline.extras.__file__).parent.iterdir() if list(path.glob("*.py")))
 
@@ -25,3 +28,10 @@ def test_each_extra_says_what_it_adds_and_where_it_enters(folder: Path) -> None:
 
 def test_the_table_names_no_folder_that_is_not_an_extra() -> None:
     assert {place.partition(".")[0] for place in EXTRAS.values()} <= {folder.name for folder in FOLDERS}
+
+
+def test_what_workers_and_children_load_ahead_is_there() -> None:
+    loads = [*STAGES, *(load for job in ("reconstruct", "classify") for load in loads_of(job, footprints=True))]
+    for load in loads:
+        module, *name = load.split(":")
+        assert hasattr(importlib.import_module(module), name[0] if name else "__name__"), load

@@ -15,10 +15,13 @@ from pipeline.runtime.isolation.start_up import start_own_process
 from pipeline.runtime.monitoring import log_lines, logs
 
 STAGES = (
-    *(
-        f"pipeline.runtime.stages.{name}"
-        for name in ("ingest", "ground", "split", "join", "reconstruct", "child_batch", "publish")
-    ),
+    "pipeline.runtime.stages.ingest",
+    "pipeline.runtime.stages.ground_stage",
+    "pipeline.runtime.stages.split",
+    "pipeline.runtime.stages.join",
+    "pipeline.runtime.stages.reconstruct",
+    "pipeline.runtime.stages.child_batch",
+    "pipeline.runtime.stages.publish",
     "pipeline.strip_alignment",
     "pipeline.recipe",
 )

@@ -166,12 +166,12 @@ def test_every_level_of_detail_that_was_asked_for_is_listed() -> None:
 
 
 GUIDED = {
-    "roof.guides.guided_outline": lambda _, guides, *__: guides,
-    "roof.guides.inner_pieces": lambda guides, *_: guides,
-    "roof.enclosed_planes.with_enclosed_planes": lambda *_: True,
+    "extras.guides.guide_matching.guided_outline": lambda _, guides, *__: guides,
+    "extras.guides.guide_matching.inner_pieces": lambda guides, *_: guides,
+    "extras.guides.enclosed_planes.with_enclosed_planes": lambda *_: True,
     "roof.plan.arrange": lambda *given: len(given[-1].pieces),
-    "roof.guided_faces.misfits_of": lambda *_: True,
-    "roof.guides.followed": lambda guides, *_: guides,
+    "extras.guides.guided_faces.misfits_of": lambda *_: True,
+    "extras.guides.guide_matching.followed": lambda guides, *_: guides,
 }
 """The steps that need guides, and whether they get any."""
 
