@@ -165,7 +165,8 @@ class Batch:
         for one in all_options():
             if one.meta["table"] and one.name not in found:
                 value = getattr(getattr(self, one.meta["table"]), one.name)
-                if one.default is None and (value in ("", AUTO) or value is True):
+                empty = AUTO if one.type is int else ""
+                if one.default is None and (value == empty or value is True):
                     value = None
                 found[one.name] = self.whole(value) if one.is_path and value is not None else value
         return found

@@ -54,7 +54,7 @@ class ReadOptions:
     crs: str | None = None
     """EPSG code, WKT or PROJ string that overrides the header's CRS."""
     vertical_unit: str | None = None
-    """Unit of elevation that overrides the header's: m, ft, us-ft or another word of `crs.UNITS_M`."""
+    """Unit of elevation that overrides the header's: m, ft, us-ft or another word of `crs_given.UNITS_M`."""
     bbox: tuple[float, float, float, float] | None = None
     """x_min, y_min, x_max, y_max in the units of the CRS; closed."""
     aoi: Polygon | MultiPolygon | None = None

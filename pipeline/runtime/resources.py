@@ -84,7 +84,7 @@ def resources_of(given: Mapping[str, Any], **further: Any) -> Resources:
     """
     values = values_of(ResourceOptions, given)
     tls = [values.pop(f"tls_{name}", None) for name in ("ca", "cert", "key")]
-    if any(tls) or any(name.startswith("GABLEWORK_TLS_") for name in os.environ):
+    if any(tls) or ("tls_ca" in given and any(name.startswith("GABLEWORK_TLS_") for name in os.environ)):
         from pipeline.runtime.cluster.tls import given_tls
 
         further["tls"] = given_tls(*tls)

@@ -31,7 +31,7 @@ CONNECTING = (FacetKind.STEP, FacetKind.SEAM)
 _NARROW_M = 1.0
 """Narrower surfaces count as this wide: their width is known no better."""
 _LEAST_SEAM_M = 2.0
-"""Shorter seams join nothing, as shorter borders of patches do not in `terrain.units`. Not a setting: what they join is
+"""Shorter seams join nothing, as shorter borders of patches do not in `unit_division`. Not a setting: what they join is
 divided into units again, at steps."""
 _GLASS_SHARE = 0.15
 """Least share of the points in a candidate's outline that were seen through it. Not a setting: it is below that of

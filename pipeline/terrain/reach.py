@@ -9,7 +9,7 @@ PIT_CELLS = 2
 """The pit test looks at the 24 cells around a cell."""
 
 ROOFS_ALONE_CELLS = 129
-"""The verdict whether anything was seen around a given footprint: `terrain.roofs_alone` says what adds up to it."""
+"""The verdict whether anything was seen around a given footprint: `roofs_alone` says what adds up to it."""
 
 GAP_CELLS = 4
 """Gaps between points are closed this far from their rims; the fill is smoothed in as many rounds."""

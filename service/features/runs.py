@@ -15,7 +15,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import RunError, causes
-from service.errors import NoSuchCollectionError, NoSuchOutputError, ResultNotReadyError, StartUpError
+from service.disk import has_no_space
+from service.errors import NoSpaceError, NoSuchCollectionError, NoSuchOutputError, ResultNotReadyError, StartUpError
 from service.features.index import GONE, TABLES, RowIndex
 
 if TYPE_CHECKING:
@@ -191,7 +192,9 @@ class PublishedRun:
         return OpenRun(name=self.name, version=version, index=RowIndex(path))
 
 
-_making = threading.Lock()
+_UNREADABLE = "files of this job are gone or damaged; the log of the service says which"
+_making: dict[Path, threading.Lock] = {}
+"""A lock per index that is missing: one thread makes it."""
 
 
 def job_index(index: Path, run_dir: Path) -> RowIndex:
@@ -200,19 +203,27 @@ def job_index(index: Path, run_dir: Path) -> RowIndex:
     Raises
     ------
     NoSuchOutputError
-        The job's files are gone.
+        The job's files are gone, or cannot be read; the log has the cause of the latter.
+    NoSpaceError
+        The disk is full.
     """
+    if index.is_file():
+        return RowIndex(index)
     from pipeline.io import arrow_at
     from pipeline.runtime.manifest_reading import read_manifest
 
-    if not index.is_file():
-        with _making:
-            try:
-                if not index.is_file():
-                    filesystem, place = arrow_at(str(run_dir))
-                    _write(index, place, filesystem, read_manifest(place, filesystem))
-            except (RunError, OSError) as error:
+    with _making.setdefault(index, threading.Lock()):
+        try:
+            if not index.is_file():
+                filesystem, place = arrow_at(str(run_dir))
+                _write(index, place, filesystem, read_manifest(place, filesystem))
+        except (RunError, OSError) as error:
+            if not run_dir.is_dir():
                 raise NoSuchOutputError(GONE) from error
+            if has_no_space(error):
+                raise NoSpaceError("the disk is full: there is no room for the index of the buildings") from error
+            _log.warning("the buildings of %s cannot be indexed: %s", run_dir, error)
+            raise NoSuchOutputError(_UNREADABLE) from error
     return RowIndex(index)
 
 

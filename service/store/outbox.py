@@ -54,19 +54,17 @@ def announce(connection: Connection, job: sa.Row[Any], event: EventType, now: dt
     if event.is_end:
         drop(connection, reports, f"overtaken by {event}", now)
     receivers = [*_endpoints(connection, event), *_subscriber(connection, job, event)]
-    receivers = [one for one in receivers if one.has_room or event.is_end]
-    if not receivers:
+    if not receivers or (event is EventType.PROGRESS and not _is_progress_due(connection, job.job_id, now)):
         return
-    if event is EventType.PROGRESS:
-        if not _is_progress_due(connection, job.job_id, now):
-            return
-        # those that were never tried say nothing that the new ones do not say
-        untried = _TABLE.delivery_id.in_(_free(sa.and_(reports, _TABLE.attempts == 0)))
-        connection.execute(sa.delete(WEBHOOK_DELIVERIES).where(untried))
-        drop(connection, reports, f"overtaken by {event}", now)
     changed = connection.execute(sa.select(JOBS).where(JOBS.c.job_id == job.job_id)).one()
     made = {"event_id": uuid.uuid4().hex, "job_id": job.job_id, "owner": job.owner, "event": event.value}
     connection.execute(sa.insert(WEBHOOK_EVENTS).values(**made, at=now, snapshot=snapshot_of(job_of(changed))))
+    if event is EventType.PROGRESS:
+        reported = _report_in_place(connection, reports, made["event_id"], now)
+        receivers = [one for one in receivers if (one.endpoint_id, one.url) not in reported]
+    receivers = [one for one in receivers if one.has_room or event.is_end]
+    if not receivers:
+        return
     refused = {
         "state": DeliveryState.FAILED.value,
         "reason": f"more than {MAX_WAITING} messages wait for this receiver: replay it when they are sent",
@@ -88,6 +86,19 @@ def announce(connection: Connection, job: sa.Row[Any], event: EventType, now: dt
         for one in receivers
     ]
     connection.execute(sa.insert(WEBHOOK_DELIVERIES), rows)
+
+
+def _report_in_place(
+    connection: Connection, reports: sa.ColumnElement[bool], event_id: str, now: dt.datetime
+) -> set[tuple[str | None, str]]:
+    """Give reports that were never tried the new event, drop the other ones; the endpoints and URLs of the former."""
+    columns = (_TABLE.delivery_id, _TABLE.endpoint_id, _TABLE.url)
+    untried = connection.execute(_free(sa.and_(reports, _TABLE.attempts == 0)).with_only_columns(*columns)).all()
+    ids = [row.delivery_id for row in untried]
+    drop(connection, sa.and_(reports, _TABLE.delivery_id.not_in(ids)), f"overtaken by {EventType.PROGRESS}", now)
+    values = {"event_id": event_id, "created_at": now}
+    connection.execute(sa.update(WEBHOOK_DELIVERIES).where(_TABLE.delivery_id.in_(ids)).values(**values))
+    return {(row.endpoint_id, row.url) for row in untried}
 
 
 def drop(connection: Connection, chosen: sa.ColumnElement[bool], reason: str, now: dt.datetime) -> None:

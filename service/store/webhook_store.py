@@ -271,9 +271,11 @@ class WebhookStore(DeliveryLine):
             if not found and most is not None:
                 failed = _TABLE.state == DeliveryState.FAILED.value
                 for kind in (~failed, failed):
-                    newest_first = sa.select(_TABLE.delivery_id).where(_TABLE.finished_at.is_not(None), kind)
-                    surplus = newest_first.order_by(_TABLE.finished_at.desc()).offset(most).limit(_AT_ONCE)
-                    found += connection.execute(surplus).scalars()
+                    finished = sa.select(_TABLE.delivery_id, _TABLE.finished_at).where(_TABLE.finished_at.is_not(None))
+                    newest_first = finished.where(kind).order_by(_TABLE.finished_at.desc())
+                    surplus = newest_first.offset(most).subquery()
+                    oldest_first = sa.select(surplus.c.delivery_id).order_by(surplus.c.finished_at)
+                    found += connection.execute(oldest_first.limit(_AT_ONCE)).scalars()
             connection.execute(sa.delete(WEBHOOK_ATTEMPTS).where(WEBHOOK_ATTEMPTS.c.delivery_id.in_(found)))
             connection.execute(sa.delete(WEBHOOK_DELIVERIES).where(_TABLE.delivery_id.in_(found)))
             used = sa.exists(sa.select(_TABLE.delivery_id).where(_TABLE.event_id == _EVENTS.event_id))

@@ -187,6 +187,7 @@ TYPES: Mapping[str, Any] = {
     "licence": Text,
 }
 """Types of options that check more than their own type and words."""
+_EXAMPLES: Mapping[str, Any] = {"crs": ["EPSG:28992"]}
 
 
 def type_of(option: Option) -> Any:
@@ -207,7 +208,8 @@ def _with_options(process_id: str) -> Callable[[type[Model]], type[Model]]:
             meta, kind = one.meta, type_of(one)
             # a setting that is absent comes from `settings` or is the default
             shown = {"default": getattr(DEFAULTS, one.name)} if one.is_setting else None
-            described = Field(one.default, title=meta["label"], description=meta["doc"], json_schema_extra=shown)
+            words = {"title": meta["label"], "description": meta["doc"], "examples": _EXAMPLES.get(one.name)}
+            described = Field(one.default, **words, json_schema_extra=shown)
             fields[one.input] = (kind if one.default is not None else kind | None, described)
         fields["settings"] = (
             RunSettings,

@@ -181,7 +181,9 @@ def run_variants(
         for number, (variant, one) in enumerate(zip(ways, begun.directories, strict=True)):
             one.progress = context.progress.part(number, len(ways), variant.label)
             parts.append((one, dataclasses.replace(context, progress=one.progress)))
-        models = [reconstruct(part, one.settings, found.joined, begun.guides, compared=True) for one, part in parts]
+        models = [
+            reconstruct(part, one.settings, found.joined, begun.guides, compared=len(ways) > 1) for one, part in parts
+        ]
         results = [
             publish_models(part, begun, found, modelled, one)
             for (one, part), modelled in zip(parts, models, strict=True)

@@ -38,7 +38,7 @@ class ModelledPoints:
     xyz_mm: IntArray
     """(n, 3) int64, easting, northing, elevation in mm from an origin that is known elsewhere."""
     point_class: ByteArray
-    """(n,) uint8, `pipeline.terrain.point_classes.PointClass`."""
+    """(n,) uint8, `pipeline.extras.classify.point_classes.PointClass`."""
     building: UShortArray
     """(n,) uint16, index into `buildings`; NO_BUILDING for points from which none was modelled."""
     plane: UShortArray

@@ -128,12 +128,11 @@ def _light(
 
     Raises RunError if the CRS is unknown or pvlib is missing.
     """
-    pvlib = the_pvlib()
     if run.reference.wkt is None:
         raise RunError(
-            "the CRS of the run is unknown, so the sun's place is, too: run it again with --crs, such as EPSG:25832. "
-            "`gablework solar --sky-only` needs none"
+            "the CRS of the run is unknown, so the sun's place is, too: run it again with a CRS, such as EPSG:25832"
         )
+    pvlib = the_pvlib()
     site = run.site()
     if site is None:
         return None, {}

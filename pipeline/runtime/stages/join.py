@@ -2,7 +2,8 @@
 
 The tiles have finished all surfaces that no other tile sees, and pass on the rest by columns. A task joins those of a
 block of tiles, finishes what no tile outside of the block sees, and passes on the rest; one more task joins that. The
-sites are then made tile by tile (`units.py`). The driver holds no object per building, unless footprints are given.
+sites are then made tile by tile (`divided_units.py`). The driver holds no object per building, unless footprints are
+given.
 """
 
 from __future__ import annotations

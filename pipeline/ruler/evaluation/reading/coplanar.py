@@ -56,21 +56,20 @@ class _Face(NamedTuple):
     corners: list[Point]
     area: float
     normal: Point
-
-    @property
-    def min_cosine(self) -> float:
-        """Cosine of the largest angle that it may have to a plane that it lies in: what a small error explains."""
-        spans = [max(axis) - min(axis) for axis in zip(*self.corners, strict=True)]
-        extent = math.sqrt(sum(span * span for span in spans))
-        width = 2.0 * self.area / extent if extent > 0.0 else 0.0
-        return math.cos(max(math.radians(ANGLE_DEG), math.atan2(DISTANCE_M, width)))
+    min_cosine: float
+    """Cosine of the largest angle that it may have to a plane that it lies in: what a small error explains."""
 
 
 def _face(xyz: Sequence[Point], rings: Rings, vector: Point) -> _Face:
     x, y, z = vector
     area = math.sqrt(x * x + y * y + z * z)
     scale = (1.0 if z >= 0.0 else -1.0) / area if area > 0.0 else 0.0
-    return _Face([xyz[k] for k in chain.from_iterable(rings)], area, (x * scale, y * scale, z * scale))
+    corners = [xyz[k] for k in chain.from_iterable(rings)]
+    spans = [max(axis) - min(axis) for axis in zip(*corners, strict=True)]
+    extent = math.sqrt(sum(span * span for span in spans))
+    width = 2.0 * area / extent if extent > 0.0 else 0.0
+    min_cosine = math.cos(max(math.radians(ANGLE_DEG), math.atan2(DISTANCE_M, width)))
+    return _Face(corners, area, (x * scale, y * scale, z * scale), min_cosine)
 
 
 class _Plane:

@@ -20,7 +20,7 @@ export async function* eventsOf(stream: AsyncIterable<Uint8Array>): AsyncGenerat
       if (data.length > 0) yield { data: data.join("\n"), id, retryMs };
       data = [];
     }
-    const [, field, value = ""] = /^(\w+)(?:: ?(.*))?$/.exec(line) ?? [];
+    const [, field, value = ""] = /^(\w+)(?:: ?(.*))?$/s.exec(line) ?? [];
     if (field === "data") data.push(value);
     else if (field === "id" && !value.includes("\0")) id = value;
     else if (field === "retry" && /^\d+$/.test(value)) retryMs = Number(value);
