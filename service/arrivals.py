@@ -44,7 +44,7 @@ from service.uploads import (
 
 SILENT_S = 3.0
 """Seconds without a byte after which a client that sends counts as gone if another request wants the upload: longer
-than the pauses of a slow network, shorter than the patience of a person."""
+than the pauses of a slow network, shorter than a person waits."""
 HASHING = 2
 """Threads that hash finished uploads: none waits for one large file."""
 ALGORITHMS = ("sha1", "sha256")

@@ -43,6 +43,10 @@ if TYPE_CHECKING:
 
 _PITCH_SPACINGS = 1.2
 """Pitch of the samples in empty places, in point spacings: about as dense as the points."""
+_MIN_PITCH_MM = 50
+"""Least pitch of these samples."""
+_MIN_SPACING_M, _MAX_SPACING_M = 0.1, 3.0
+"""Limits of the point spacing: duplicates make it tiny, a few points in a wide footprint huge."""
 _MARGIN_SPACINGS = 4.0
 """Margin around the points, in point spacings: room for the eave and for samples beyond it."""
 _MAX_EXTENT_M = 1900.0
@@ -116,7 +120,7 @@ def roof_points(cloud: PreparedCloud, settings: RoofSettings, decisions: list[De
         index=index,
         labels=np.full(len(index), -1, np.int32),
         split=_are_among(xy_mm, candidate.split_returns),
-        spacing_m=min(max(spacing_over_area_m(points), 0.1), 3.0),
+        spacing_m=min(max(spacing_over_area_m(points), _MIN_SPACING_M), _MAX_SPACING_M),
         footprint_mm=_in_mm(candidate.footprint),
         outline_mm=_in_mm(candidate.outline),
         facades=_facades(candidate, points) if settings.at_walls or settings.finds_walls else None,
@@ -193,7 +197,7 @@ def _traced_plan(roof: RoofPoints, planes: Sequence[Plane], settings: RoofSettin
         bounds = np.rint(given.bounds).astype(np.int64)
         low, high = np.minimum(low, bounds[:2] - margin), np.maximum(high, bounds[2:] + margin)
     _require_extent(float((high - low).max()) * 1e-3)
-    pitch = max(50, round(_PITCH_SPACINGS * roof.spacing_m * 1e3))
+    pitch = max(_MIN_PITCH_MM, round(_PITCH_SPACINGS * roof.spacing_m * 1e3))
     gap_m = settings.gap_spacings * roof.spacing_m
     samples = empty_samples(roof.xy_mm, low, high, pitch, gap_m)
     frame = _frame(low, high, margin)

@@ -9,17 +9,60 @@ house.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.kernels.heap import heap_pop, heap_push, heap_with_room
 from pipeline.kernels.sorting import ascending_order
+from pipeline.kernels.union_find import root_of
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
 from pipeline.segmentation.plane_regression import best_fit_plane, cosine_of_slope, mean_square_residual
 from pipeline.segmentation.point_votes import ascending_once
 
-_NO_MERGE = 1e30  # a cost above every real one
+_NO_MERGE = 1e30
+"""Residual of clusters that must not merge: above every real one."""
+_SMALL_CLUSTER_ANGLES = 2.0
+"""Planes of small clusters may differ by so many times the angle: the normal of a few points is as uncertain."""
+
+
+class _Clusters(NamedTuple):
+    """Clusters while they are merged; arrays of one length n."""
+
+    sums: FloatArray
+    """(n, 10) float64, as `plane_regression.cluster_sums` gives them."""
+    planes: FloatArray
+    """(n, 3) float64, (a, b, c)."""
+    root: IntArray
+    """(n,) int64, the cluster that each became part of, itself where it did not."""
+    version: LabelArray
+    """(n,) int32, merges of each: a queued pair of an older version is stale."""
+
+
+class _Limits(NamedTuple):
+    """Conditions for a merge."""
+
+    max_residual_m: float
+    min_cosine: float
+    """Least cosine of the angle between two planes."""
+    min_cosine_small: float
+    """The same if one of the clusters is small."""
+    small: float
+    """Points below which a cluster is small."""
+
+
+class _Chains(NamedTuple):
+    """Chains of the partners of n clusters, with two entries per pair; -1 ends a chain."""
+
+    first: IntArray
+    """(n,) int64, first entry of each cluster's chain."""
+    last: IntArray
+    """(n,) int64, last entry."""
+    following: IntArray
+    """(2 m,) int64, next entry."""
+    partner: IntArray
+    """(2 m,) int64, the cluster that an entry names."""
 
 
 @kernel
@@ -94,14 +137,14 @@ def _cosine_between(planes: FloatArray, i: int, j: int) -> float:
 
 
 @kernel
-def _merged_residual(
-    sums: FloatArray, planes: FloatArray, i: int, j: int, min_cosine: float, min_cosine_small: float, small: float
-) -> float:
+def _merged_residual(clusters: _Clusters, i: int, j: int, limits: _Limits) -> float:
     """Systematic residual in metres that the common plane adds to the worse of two clusters; huge where it must not be.
 
     The mean square of a cluster about the common plane is that about its own plane (noise) plus a systematic part.
     """
-    if _cosine_between(planes, i, j) < (min_cosine if min(sums[i, 0], sums[j, 0]) >= small else min_cosine_small):
+    sums, planes = clusters.sums, clusters.planes
+    is_small = min(sums[i, 0], sums[j, 0]) < limits.small
+    if _cosine_between(planes, i, j) < (limits.min_cosine_small if is_small else limits.min_cosine):
         return _NO_MERGE
     a, b, c, fitted = best_fit_plane(sums[i] + sums[j])
     if not fitted:
@@ -116,11 +159,8 @@ def _merged_residual(
 
 
 @kernel
-def _chains_of_partners(pairs: IntArray, n: int) -> tuple[IntArray, IntArray, IntArray, IntArray]:
-    """Chains of the partners of n clusters: first and last entry of each, (n,); what follows an entry, its partner.
-
-    Two entries per pair, in the order of the pairs, codes low * n + high; -1 ends a chain.
-    """
+def _chains_of_partners(pairs: IntArray, n: int) -> _Chains:
+    """Chains in the order of the pairs, codes low * n + high."""
     first = np.full(n, -1, np.int64)
     last = np.full(n, -1, np.int64)
     following = np.full(2 * pairs.size, -1, np.int64)
@@ -134,10 +174,46 @@ def _chains_of_partners(pairs: IntArray, n: int) -> tuple[IntArray, IntArray, In
             else:
                 following[last[owner]] = entry
             last[owner] = entry
-    return first, last, following, partner
+    return _Chains(first, last, following, partner)
 
 
-# It stays whole: its loop changes ten arrays and counters, which parts would pass around and compile apart.
+@kernel
+def _absorb(clusters: _Clusters, chains: _Chains, i: int, j: int) -> None:
+    """Add cluster j with its chain to cluster i, and fit the plane of i again."""
+    sums, planes = clusters.sums, clusters.planes
+    clusters.root[j] = i
+    clusters.version[i] += 1
+    clusters.version[j] = -1
+    sums[i] += sums[j]
+    planes[i, 0], planes[i, 1], planes[i, 2], _ = best_fit_plane(sums[i])
+    chains.following[chains.last[i]] = chains.first[j]
+    chains.last[i] = chains.last[j]
+
+
+@kernel
+def _remove_repeated(chains: _Chains, root: IntArray, i: int, seen: IntArray, stamp: int) -> None:
+    """Name the partners of a cluster by their roots; entries for itself or a partner named before are removed.
+
+    `seen` (n,) holds the last stamp of each partner; no stamp comes twice.
+    """
+    before = -1
+    entry = chains.first[i]
+    while entry >= 0:
+        other = root_of(root, chains.partner[entry])
+        if other == i or seen[other] == stamp:
+            if before < 0:
+                chains.first[i] = chains.following[entry]
+            else:
+                chains.following[before] = chains.following[entry]
+                if chains.last[i] == entry:
+                    chains.last[i] = before
+        else:
+            seen[other] = stamp
+            chains.partner[entry] = other
+            before = entry
+        entry = chains.following[entry]
+
+
 @kernel
 def merge_planes(
     sums: FloatArray,
@@ -173,24 +249,25 @@ def merge_planes(
         Comparisons made; beyond the limit the merging is not complete.
     """
     n = sums.shape[0]
-    min_cosine = math.cos(math.radians(max_angle_deg))
-    min_cosine_small = math.cos(math.radians(2.0 * max_angle_deg))
-    small = float(small_cluster_points)
-    root = np.arange(n).astype(np.int32)
-    version = np.zeros(n, np.int32)
-    first, last, following, partner = _chains_of_partners(pairs, n)
+    limits = _Limits(
+        max_residual_m,
+        math.cos(math.radians(max_angle_deg)),
+        math.cos(math.radians(_SMALL_CLUSTER_ANGLES * max_angle_deg)),
+        float(small_cluster_points),
+    )
+    clusters = _Clusters(sums, planes, np.arange(n), np.zeros(n, np.int32))
+    root, version = clusters.root, clusters.version
+    chains = _chains_of_partners(pairs, n)
     # pairs of clusters, low * n + high, with the sum of their versions
-    queue = heap_with_room(pairs.size + 16)
+    queue = heap_with_room(pairs.size)
     held = 0
-    work = 0
     for p in range(pairs.size):
-        i, j = pairs[p] // n, pairs[p] % n
-        work += 1
-        residual = _merged_residual(sums, planes, i, j, min_cosine, min_cosine_small, small)
+        residual = _merged_residual(clusters, pairs[p] // n, pairs[p] % n, limits)
         if residual < max_residual_m:
             queue = heap_push(queue, held, residual, pairs[p], 0)
             held += 1
-    mark = np.full(n, -1, np.int64)
+    work = pairs.size
+    seen = np.full(n, -1, np.int64)
     merges = 0
     while held > 0:
         i, j = queue.ranks[0] // n, queue.ranks[0] % n
@@ -200,44 +277,20 @@ def merge_planes(
         if stale:
             continue
         merges += 1
-        root[j] = i
-        version[i] += 1
-        version[j] = -1
-        sums[i] += sums[j]
-        planes[i, 0], planes[i, 1], planes[i, 2], _ = best_fit_plane(sums[i])
-        following[last[i]] = first[j]
-        last[i] = last[j]
-        # The merged cluster is compared with all partners of both, each once; spent entries leave the chain.
-        before = np.int64(-1)
-        entry = first[i]
+        _absorb(clusters, chains, i, j)
+        _remove_repeated(chains, root, i, seen, merges)
+        entry = chains.first[i]
         while entry >= 0:
-            other = partner[entry]
-            while root[other] != other:
-                other = root[other]
-            if other == i or mark[other] == merges:
-                if before < 0:
-                    first[i] = following[entry]
-                else:
-                    following[before] = following[entry]
-                    if last[i] == entry:
-                        last[i] = before
-                entry = following[entry]
-                continue
-            mark[other] = merges
-            partner[entry] = other
+            other = chains.partner[entry]
             work += 1
             low, high = min(i, other), max(i, other)
-            residual = _merged_residual(sums, planes, low, high, min_cosine, min_cosine_small, small)
+            residual = _merged_residual(clusters, low, high, limits)
             if residual < max_residual_m:
                 queue = heap_push(queue, held, residual, low * n + high, version[low] + version[high])
                 held += 1
-            before = entry
-            entry = following[entry]
+            entry = chains.following[entry]
         if work > work_limit:
             break
     for k in range(n):
-        r = k
-        while root[r] != r:
-            r = root[r]
-        root[k] = r
-    return root, work
+        root[k] = root_of(root, k)
+    return root.astype(np.int32), work

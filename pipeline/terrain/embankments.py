@@ -24,7 +24,9 @@ from pipeline.terrain.planar_fitting import MIN_SPREAD
 from pipeline.terrain.reach import BLOCK_CELLS, LINK_CELLS
 
 _STRIDE = 16
-"""Cells from one block to the next: each cell lies in nine blocks, so no surface is cut at one place only."""
+"""Cells from one block to the next: each cell lies in nine blocks, so no surface is cut at one place only.
+
+This and the following define what an embankment is; how large one must be can be set."""
 
 _SQUARES = BLOCK_CELLS // _STRIDE
 """Squares of that side along a side of a block."""
@@ -32,47 +34,50 @@ _SQUARES = BLOCK_CELLS // _STRIDE
 _NOISE_MM = 300.0
 """Two points of one smooth surface may differ by this much: the noise of ranges and low plants."""
 
-_ALONG = 0.7
+_MAX_SURFACE_SLOPE = 0.7
 """Rise over run between neighbouring cells of one surface, 35 degrees: a steeper step parts two surfaces."""
 
-_STEEPEST = 1.0
+_MAX_GROUND_SLOPE = 1.0
 """Rise over run between points of ground, as in `between_walls`: what is steeper is a wall."""
 
-_OFF_CELLS = 0.6
+_POINT_OFFSET_CELLS = 0.6
 """Points may lie this much farther apart than the middles of their cells."""
 
-_LEVEL = 0.2
+_LEVEL_SLOPE = 0.2
 """Rise over run up to which a surface meets the ground on a level, as decks and roofs beside a hill do: no slope."""
 
-_LEVEL_MM = 250.0
-"""The same as a height, with which ground rejoins by planes."""
+_LEVEL_STEP_MM = 250.0
+"""Added to it, the same step with which ground rejoins by planes."""
 
-_SMOOTH_MM = 500.0
+_MAX_ROUGHNESS_MM = 500.0
 """Farthest that a cell may lie from the plane of its neighbours to join: crowns and bushes are rougher."""
 
-_SLOPED_SHARE = 0.45
+_MIN_SLOPED_SHARE = 0.45
 """Share of the links to lower ground that must be slopes. A dam with a wall on one side has about half of them."""
 
-_WIDE_SHARE = 2 / 3
+_MIN_SLOPED_SHARE_WIDE = 2 / 3
 """The same for cells of wide objects: a hall that the data's edge cuts may have half of them where points are few."""
 
-_NARROW_SHARE = 1 / 3
+_MAX_NARROW_SHARE = 1 / 3
 """Largest share of a surface's cells that may lie on narrow objects: more is a row of houses and hedges."""
 
-_NEIGHBOURS = 8
-"""A plane goes through so many cells at most: the eight around a cell if all hold a point."""
+_MAX_PLANE_CELLS = 8
+"""Most cells that the plane around a cell is fitted to: the eight around it if all hold a point."""
 
-_FEWEST = 4
-"""Fewest of them: one more than determine a plane."""
+_MIN_PLANE_CELLS = 4
+"""Fewest such cells: one more than determine a plane."""
 
-_PLANE_CELLS = 5
-"""Farthest of them."""
+_PLANE_REACH_CELLS = 5
+"""Farthest such cell."""
 
-_VORONOI = 0.87
+_AREA_OF_DISTANCE2 = 0.87
 """Ground that a point stands for, in squares of the distance to its neighbours: six equal triangles meet at it. Cells
 without gaps have neighbours across their corners, too, and count 1.27 of their area; where points are few, less."""
 
-_MOST_LINKS = 12
+_DM2_PER_M2 = 100
+"""Areas are added up as whole numbers, so that their order does not matter."""
+
+_MAX_LINKS = 12
 """Room for the links of one cell. A cell has 8 if all cells around it hold a point."""
 
 
@@ -86,16 +91,16 @@ def _offsets(reach: int) -> npt.NDArray[np.int64]:
 _OFFSETS = _offsets(LINK_CELLS)
 _NONE = np.uint8(255)
 
-_BITS = 62
-"""Offsets in a word of a set of offsets."""
+_WORD_BITS = 62
+"""Offsets in a word of a set of offsets: shifts by fewer bits keep an int64 positive."""
 
 
 def _hidden(offsets: npt.NDArray[np.int64]) -> IntArray:
     """Which offsets each offset hides, (offsets, words) sets: those with it in the circle between them and a cell."""
     hides = offsets @ offsets.T > np.sum(offsets * offsets, axis=1)[:, None]
     words = [
-        [sum(1 << k for k in np.flatnonzero(row[i : i + _BITS]).tolist()) for row in hides]
-        for i in range(0, len(offsets), _BITS)
+        [sum(1 << k for k in np.flatnonzero(row[i : i + _WORD_BITS]).tolist()) for row in hides]
+        for i in range(0, len(offsets), _WORD_BITS)
     ]
     return np.ascontiguousarray(np.array(words, np.int64).T)
 
@@ -109,26 +114,26 @@ Counts = npt.NDArray[np.int64]
 """(objects, 6) int64: what a cell adds to the sums of its surface."""
 
 Links = npt.NDArray[np.uint8]
-"""(objects, `_MOST_LINKS`) uint8, rows of `_OFFSETS` from a cell to its neighbours, then `_NONE`."""
+"""(objects, `_MAX_LINKS`) uint8, rows of `_OFFSETS` from a cell to its neighbours, then `_NONE`."""
 
 
 @kernel
 def _link(links: Links, hidden: IntArray, lowest: Elevations, r: int, c: int) -> None:
-    """Write the neighbours of one cell to `links` (`_MOST_LINKS`,); `hidden` (words,) is scratch."""
+    """Write the neighbours of one cell to `links` (`_MAX_LINKS`,); `hidden` (words,) is scratch."""
     rows, columns = lowest.shape
     found = 0
     hidden[:] = 0
     for word in range(len(hidden)):
-        first = word * _BITS
+        first = word * _WORD_BITS
         # the offsets from `k` on that no neighbour hides, as bits: few are left when neighbours lie on all sides
-        left, k = ((1 << min(_BITS, len(_OFFSETS) - first)) - 1) & ~hidden[word], first
+        left, k = ((1 << min(_WORD_BITS, len(_OFFSETS) - first)) - 1) & ~hidden[word], first
         while left != 0:
             if left & 1 == 1:
                 a, b = r + _OFFSETS[k, 0], c + _OFFSETS[k, 1]
                 if 0 <= a < rows and 0 <= b < columns and lowest[a, b] != NO_DATA:
                     links[found] = k
                     found += 1
-                    if found == _MOST_LINKS:
+                    if found == _MAX_LINKS:
                         return
                     left &= ~(_HIDDEN[k, word] >> (k - first))
                     for later in range(word + 1, len(hidden)):
@@ -145,7 +150,7 @@ def _linked(lowest: Elevations, cells: IntArray) -> Links:
     are the same everywhere, whatever the distance of the points.
     """
     columns = lowest.shape[1]
-    links = np.full((len(cells), _MOST_LINKS), _NONE, np.uint8)
+    links = np.full((len(cells), _MAX_LINKS), _NONE, np.uint8)
     hidden = np.zeros(_HIDDEN.shape[1], np.int64)
     for i in range(len(cells)):
         _link(links[i], hidden, lowest, cells[i] // columns, cells[i] % columns)
@@ -154,25 +159,25 @@ def _linked(lowest: Elevations, cells: IntArray) -> Links:
 
 @kernel
 def _is_smooth(lowest: Elevations, r: int, c: int) -> bool:
-    """Whether a cell lies within `_SMOOTH_MM` of the plane through those around it that continue the surface."""
+    """Whether a cell lies within `_MAX_ROUGHNESS_MM` of the plane through those around it that continue the surface."""
     rows, columns = lowest.shape
     n, x, y, z, xx, xy, yy, xz, yz = 0, 0, 0, 0, 0, 0, 0, 0, 0
     for k in range(len(_OFFSETS)):
         down, across = _OFFSETS[k, 0], _OFFSETS[k, 1]
         apart = down * down + across * across
-        if n == _NEIGHBOURS or apart > _PLANE_CELLS * _PLANE_CELLS:
+        if n == _MAX_PLANE_CELLS or apart > _PLANE_REACH_CELLS * _PLANE_REACH_CELLS:
             break
         a, b = r + down, c + across
         if a < 0 or a >= rows or b < 0 or b >= columns or lowest[a, b] == NO_DATA:
             continue
         h = np.int64(lowest[a, b]) - lowest[r, c]
-        if abs(h) > _NOISE_MM + _ALONG * CELL_MM * math.sqrt(apart):
+        if abs(h) > _NOISE_MM + _MAX_SURFACE_SLOPE * CELL_MM * math.sqrt(apart):
             continue
         n += 1
         x, y, z = x + across, y + down, z + h
         xx, xy, yy = xx + across * across, xy + across * down, yy + down * down
         xz, yz = xz + across * h, yz + down * h
-    if n < _FEWEST:
+    if n < _MIN_PLANE_CELLS:
         return False
     vxx, vxy, vyy = xx - x * x / n, xy - x * y / n, yy - y * y / n
     det = vxx * vyy - vxy * vxy
@@ -180,7 +185,7 @@ def _is_smooth(lowest: Elevations, r: int, c: int) -> bool:
         return False
     vxz, vyz = xz - x * z / n, yz - y * z / n
     east, north = solve_plane_moments(vxx, vxy, vyy, vxz, vyz)
-    return abs((z - east * x - north * y) / n) <= _SMOOTH_MM
+    return abs((z - east * x - north * y) / n) <= _MAX_ROUGHNESS_MM
 
 
 @kernel
@@ -201,12 +206,12 @@ def _counted(lowest: Elevations, ground: BoolArray, cells: IntArray, links: Link
             rise = lowest[r, c] - lowest[a, b]
             if not ground[a, b]:
                 continue
-            if rise > _NOISE_MM + _STEEPEST * CELL_MM * (far + _OFF_CELLS):
+            if rise > _NOISE_MM + _MAX_GROUND_SLOPE * CELL_MM * (far + _POINT_OFFSET_CELLS):
                 out[i, _WALLS] += 1
-            elif rise > _LEVEL_MM + _LEVEL * CELL_MM * far:
+            elif rise > _LEVEL_STEP_MM + _LEVEL_SLOPE * CELL_MM * far:
                 out[i, _SLOPES] += 1
         if number > 0:
-            out[i, _DM2] = round(100 * _VORONOI * (total / number) ** 2)
+            out[i, _DM2] = round(_DM2_PER_M2 * _AREA_OF_DISTANCE2 * (total / number) ** 2)
     return out
 
 
@@ -217,13 +222,13 @@ def _continued(lowest: Elevations, cells: IntArray, links: Links) -> BoolArray:
     out = np.zeros(links.shape, np.bool_)
     for i in range(len(cells)):
         r, c = cells[i] // columns, cells[i] % columns
-        for m in range(_MOST_LINKS):
+        for m in range(_MAX_LINKS):
             k = links[i, m]
             if k == _NONE:
                 break
             down, across = _OFFSETS[k, 0], _OFFSETS[k, 1]
             step = abs(lowest[r, c] - lowest[r + down, c + across])
-            out[i, m] = step <= _NOISE_MM + _ALONG * CELL_MM * math.sqrt(down * down + across * across)
+            out[i, m] = step <= _NOISE_MM + _MAX_SURFACE_SLOPE * CELL_MM * math.sqrt(down * down + across * across)
     return out
 
 
@@ -242,7 +247,7 @@ def _parts(
     pairs = 0
     for i in range(len(cells)):
         r, c = cells[i] // columns, cells[i] % columns
-        for m in range(_MOST_LINKS):
+        for m in range(_MAX_LINKS):
             k = links[i, m]
             if k == _NONE:
                 break
@@ -302,9 +307,9 @@ def _judge_block(
     for at in within:
         for i in members[starts[at] : starts[at + 1]]:
             of = whole[surface[i]]
-            if of[_DM2] < least_dm2 or of[_NARROW] > _NARROW_SHARE * of[_CELLS] or of[_SLOPES] == 0:
+            if of[_DM2] < least_dm2 or of[_NARROW] > _MAX_NARROW_SHARE * of[_CELLS] or of[_SLOPES] == 0:
                 continue
-            for is_wide, share in enumerate((_SLOPED_SHARE, _WIDE_SHARE)):
+            for is_wide, share in enumerate((_MIN_SLOPED_SHARE, _MIN_SLOPED_SHARE_WIDE)):
                 if of[_SLOPES] >= share * (of[_SLOPES] + of[_WALLS]):
                     joins[i, is_wide] = True
     for at in within:
@@ -401,7 +406,7 @@ def embankments(
     starts, members = counting_sort(square_of, high * broad)
     pair_starts, pairs = counting_sort(square_of[between[:, 0]], high * broad)
     squares = _Squares(sums, starts, members, between[pairs], pair_starts)
-    joins = _joining(squares, (high, broad), 100 * least_m2)
+    joins = _joining(squares, (high, broad), _DM2_PER_M2 * least_m2)
     out = np.zeros((rows, columns), np.bool_)
     for i in range(n):
         if counts[i, _NARROW] == 0 and joins[part[i], counts[i, _WIDE]]:

@@ -8,7 +8,7 @@ RemoteError               of the pipeline: a service elsewhere
 ├── JobFailedError        a job that failed, with its reason
 ├── JobDismissedError     a job that was dismissed
 └── RefusedError          a request that the service refuses
-    ├── BusyError         for now: too many requests, no room, a busy database; the patience was used up
+    ├── BusyError         for now: too many requests, no room, a busy database; the timeout has passed
     ├── UnauthorizedError no key, or one that is not known
     ├── ForbiddenError    a key without the scope
     └── NotFoundError     no such job, upload or result, or results that are not ready

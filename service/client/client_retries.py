@@ -10,9 +10,9 @@ from pipeline.backoff import Backoff
 BACKOFF = Backoff(first_s=0.5, longest_s=15.0)
 """Pauses that the client chooses by itself."""
 FIRST_CONTACT_S = 5.0
-"""Seconds of patience with a service that has never answered: its URL is probably wrong."""
+"""Timeout in seconds for a service that has never answered: its URL is probably wrong."""
 PATIENCE_S = 300.0
-"""Default patience in seconds: enough for the restart of a service."""
+"""Default timeout in seconds of a call: enough for the restart of a service."""
 
 PASSING = frozenset({408, 425, 429, 502, 503, 504})
 """Status codes after which another attempt may help."""

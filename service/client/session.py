@@ -247,7 +247,7 @@ class Session:
         Raises
         ------
         RefusedError, ForeignAnswerError
-            Another one cannot help, or the patience is used up.
+            Another one cannot help, or `patience_s` has passed.
         """
         retry_after = answer.headers.get("retry-after")
         if not can_pass and not is_passing(answer.status, retry_after):

@@ -166,7 +166,7 @@ def test_what_most_jobs_need_is_enough_for_the_default(asked: dict[str, Any], al
 def test_a_driver_that_ends_while_it_compiles_starts_no_workers(bench: Bench) -> None:
     compiler = Compiler()
     kernels = Kernels(compiles=True, compile_groups=compiler)
-    bench.performs = lambda shop, name: InOwnProcess(shop, name, kernels=kernels)
+    bench.performs = lambda parts, name: InOwnProcess(parts, name, kernels=kernels)
     started = Engine.started
     driver = bench.driver()
     wait_for(lambda: compiler.calls, "the compiler")
@@ -181,7 +181,7 @@ def test_the_job_shows_the_stage_before_all_others(bench: Bench) -> None:
     """With a real driver and processes of attempts: the words are in the job and in its events."""
     compiler = Compiler()
     kernels = Kernels(compiles=True, compile_groups=compiler)
-    bench.performs = lambda shop, name: InOwnProcess(shop, name, kernels=kernels)
+    bench.performs = lambda parts, name: InOwnProcess(parts, name, kernels=kernels)
     job = bench.submit()
     bench.driver()
     wait_for(lambda: bench.store.get(job.job_id).stage == "compile", "the stage")

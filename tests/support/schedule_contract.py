@@ -115,15 +115,15 @@ class ScheduleContract:
         assert schedule.entries()[0].message == "a run was still under way"
 
     def test_a_slot_that_waits_is_run_after_the_run_and_a_later_one_replaces_it(self, schedule: StoredSchedule) -> None:
-        patient = rules(overlap=Overlap.WAIT)
-        assert look_at(schedule, NOON + HOUR, patient, is_busy=True) is None
-        assert look_at(schedule, NOON + HOUR + MINUTE, patient, is_busy=True) is None
+        waiting = rules(overlap=Overlap.WAIT)
+        assert look_at(schedule, NOON + HOUR, waiting, is_busy=True) is None
+        assert look_at(schedule, NOON + HOUR + MINUTE, waiting, is_busy=True) is None
         assert (history(schedule), schedule.counts()) == ([(Outcome.WAITING, NOON + HOUR, 1)], {})
-        assert look_at(schedule, NOON + 2 * HOUR, patient, is_busy=True) is None
+        assert look_at(schedule, NOON + 2 * HOUR, waiting, is_busy=True) is None
         assert state_of(schedule).waiting == NOON + 2 * HOUR
         # not at its next time: as soon as the run is over
-        assert look_at(schedule, NOON + 2 * HOUR + MINUTE, patient) == NOON + 2 * HOUR
-        assert look_at(schedule, NOON + 2 * HOUR + 2 * MINUTE, patient) is None
+        assert look_at(schedule, NOON + 2 * HOUR + MINUTE, waiting) == NOON + 2 * HOUR
+        assert look_at(schedule, NOON + 2 * HOUR + 2 * MINUTE, waiting) is None
         assert history(schedule) == [(Outcome.MISSED, NOON + HOUR, 1), (schedule.done, NOON + 2 * HOUR, 1)]
         assert state_of(schedule).waiting is None
         assert schedule.counts() == {"missed": 1, schedule.done: 1}
@@ -168,10 +168,10 @@ class ScheduleContract:
     def test_a_slot_that_had_its_run_does_not_wait_for_another(self, schedule: StoredSchedule) -> None:
         look_at(schedule, NOON + DAY)
         look_at(schedule, NOON + HOUR / 2)
-        patient = rules(overlap=Overlap.WAIT)
-        assert look_at(schedule, NOON + DAY + MINUTE, patient, is_busy=True) is None
+        waiting = rules(overlap=Overlap.WAIT)
+        assert look_at(schedule, NOON + DAY + MINUTE, waiting, is_busy=True) is None
         assert state_of(schedule).waiting is None
-        assert look_at(schedule, NOON + DAY + 2 * MINUTE, patient) is None
+        assert look_at(schedule, NOON + DAY + 2 * MINUTE, waiting) is None
 
     def test_a_clock_that_is_put_back_does_not_matter_to_a_paused_schedule(self, schedule: StoredSchedule) -> None:
         look_at(schedule, NOON + 10 * DAY, rules(is_paused=True))

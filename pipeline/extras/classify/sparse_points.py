@@ -2,8 +2,8 @@
 
 With two points per square metre or fewer, no single surface shows where a roof ends and a tree begins. Several weak
 signs do so together: pulses that go on, the share of the surroundings on the point's level, and the distance and share
-of candidates. A logistic regression weighs them. The weights were fitted at commit 01fb6cec by
-`benchmarks/sparse_points.py`, which also scored them on places that they were not fitted on.
+of candidates. A logistic regression weighs them. `benchmarks/sparse_points.py` of commit 01fb6cec fitted the weights;
+docs/methods/scene.md names the places, and the scores on places left out of the fit.
 
 All counts are whole numbers, and each point's terms are computed alone: the chance does not depend on tiles or order.
 """
@@ -26,10 +26,16 @@ NEAR_MM, AROUND_MM, FAR_MM = 3000, 6000, 10_000
 """Radii of the three discs: 3, 10 and 30 points at 0.1 points/m2, or 1.5, 3 and 5 spacings at 0.3 points/m2."""
 LEVEL_MM = 500
 """What lies this near in elevation is on a point's level, as roofs between points some metres apart are."""
+MIN_HEIGHT_MM, TYPICAL_HEIGHT_MM, MAX_HEIGHT_MM = 500, 4000.0, 40_000
+"""Heights are limited to this range and taken as multiples of a typical one."""
+MAX_UNDER_MM = 10_000
+"""Points farther than this below a candidate's point count as this far below it."""
 BAND_MM = 1500
 """What lies this near in elevation may belong to the same pitched roof or crown; its thickness is measured."""
 HELD_CLEAR_MM = 6500
 """Candidates farther away than this do not count as near."""
+MAX_THICKNESS_M = 0.6
+"""Bands that are thicker are crowns, whatever their thickness."""
 UNKNOWN_THICKNESS_M = 0.1
 """Thickness where fewer than four points lie in the band: between that of roofs and of crowns."""
 FEWEST_IN_BAND = 4
@@ -92,75 +98,55 @@ class Sign(IntEnum):
     """The thickness of the band within 6 m."""
 
 
-PRODUCTS = (
-    (Sign.LOG_HEIGHT, Sign.HELD_SHARE),
-    (Sign.LOG_HEIGHT, Sign.PIERCED_AROUND),
-    (Sign.LOG_HEIGHT, Sign.PIERCED_NEAR),
-    (Sign.LOG_HEIGHT, Sign.LOG_DENSITY),
-    (Sign.LOG_HEIGHT_2, Sign.LOG_HELD_NEAR),
-    (Sign.LOG_DENSITY, Sign.THICKNESS_NEAR),
-    (Sign.LOG_DENSITY, Sign.SIZE),
-    (Sign.LOG_DENSITY, Sign.PIERCED_AROUND),
-    (Sign.LOG_DENSITY, Sign.PIERCED_NEAR),
-    (Sign.LOG_DENSITY, Sign.STANDING_SHARE),
-    (Sign.AWAY, Sign.SIZE),
-    (Sign.AWAY, Sign.PIERCED_AROUND),
-    (Sign.AWAY, Sign.HELD),
-    (Sign.SIZE, Sign.PIERCED_AROUND),
-    (Sign.SIZE, Sign.THICKNESS_AROUND),
-    (Sign.SIZE, Sign.LOG_HELD_NEAR),
-    (Sign.HELD_SHARE, Sign.PIERCED_HELD),
-    (Sign.HELD_SHARE, Sign.HELD_SHARE),
-    (Sign.STANDING_SHARE, Sign.PIERCED_AROUND),
-    (Sign.STANDING_SHARE, Sign.STANDING_SHARE),
-    (Sign.THICKNESS_NEAR, Sign.THICKNESS_NEAR),
-)
-"""Further terms: products of two signs. A sign says less or more beside another one: leaves of a tree over a roof."""
-WEIGHTS = (
-    1.556,  # where all terms are zero
-    -1.578,  # HELD_SHARE
-    -3.896,  # PIERCED_AROUND
-    -4.308,  # PIERCED_NEAR
-    -0.825,  # PIERCED_HELD
-    -1.021,  # PIERCED
-    -0.938,  # LOG_HELD_NEAR
-    -0.164,  # LOG_LEVEL
-    0.501,  # LOG_HELD_LEVEL
-    1.853,  # LEVEL_SHARE
-    1.903,  # LOG_HEIGHT
-    -1.318,  # LOG_HEIGHT_2
-    1.421,  # LOG_DENSITY
-    11.852,  # STANDING_SHARE
-    -1.340,  # GROUND_SHARE
-    -7.140,  # THICKNESS_NEAR
-    0.159,  # UNDER
-    -0.277,  # HELD
-    -0.154,  # SIZE
-    0.037,  # AWAY
-    -1.148,  # THICKNESS_AROUND
-    0.812,  # LOG_HEIGHT HELD_SHARE
-    -3.085,  # LOG_HEIGHT PIERCED_AROUND
-    -1.378,  # LOG_HEIGHT PIERCED_NEAR
-    0.431,  # LOG_HEIGHT LOG_DENSITY
-    0.370,  # LOG_HEIGHT_2 LOG_HELD_NEAR
-    -0.206,  # LOG_DENSITY THICKNESS_NEAR
-    -0.385,  # LOG_DENSITY SIZE
-    0.690,  # LOG_DENSITY PIERCED_AROUND
-    -1.693,  # LOG_DENSITY PIERCED_NEAR
-    1.222,  # LOG_DENSITY STANDING_SHARE
-    -0.149,  # AWAY SIZE
-    0.106,  # AWAY PIERCED_AROUND
-    0.516,  # AWAY HELD
-    1.295,  # SIZE PIERCED_AROUND
-    0.023,  # SIZE THICKNESS_AROUND
-    0.174,  # SIZE LOG_HELD_NEAR
-    -6.164,  # HELD_SHARE PIERCED_HELD
-    2.336,  # HELD_SHARE HELD_SHARE
-    -3.479,  # STANDING_SHARE PIERCED_AROUND
-    -5.655,  # STANDING_SHARE STANDING_SHARE
-    8.021,  # THICKNESS_NEAR THICKNESS_NEAR
-)
-"""Logit of the chance where all terms are zero, then the weights of the signs and of the products."""
+CHANCE_LOGIT = 1.556
+"""Logit of the chance where all terms are zero."""
+SIGN_WEIGHTS = {
+    Sign.HELD_SHARE: -1.578,
+    Sign.PIERCED_AROUND: -3.896,
+    Sign.PIERCED_NEAR: -4.308,
+    Sign.PIERCED_HELD: -0.825,
+    Sign.PIERCED: -1.021,
+    Sign.LOG_HELD_NEAR: -0.938,
+    Sign.LOG_LEVEL: -0.164,
+    Sign.LOG_HELD_LEVEL: 0.501,
+    Sign.LEVEL_SHARE: 1.853,
+    Sign.LOG_HEIGHT: 1.903,
+    Sign.LOG_HEIGHT_2: -1.318,
+    Sign.LOG_DENSITY: 1.421,
+    Sign.STANDING_SHARE: 11.852,
+    Sign.GROUND_SHARE: -1.340,
+    Sign.THICKNESS_NEAR: -7.140,
+    Sign.UNDER: 0.159,
+    Sign.HELD: -0.277,
+    Sign.SIZE: -0.154,
+    Sign.AWAY: 0.037,
+    Sign.THICKNESS_AROUND: -1.148,
+}
+"""Weights of the signs, all of them in the order of `Sign`."""
+PRODUCT_WEIGHTS = {
+    (Sign.LOG_HEIGHT, Sign.HELD_SHARE): 0.812,
+    (Sign.LOG_HEIGHT, Sign.PIERCED_AROUND): -3.085,
+    (Sign.LOG_HEIGHT, Sign.PIERCED_NEAR): -1.378,
+    (Sign.LOG_HEIGHT, Sign.LOG_DENSITY): 0.431,
+    (Sign.LOG_HEIGHT_2, Sign.LOG_HELD_NEAR): 0.370,
+    (Sign.LOG_DENSITY, Sign.THICKNESS_NEAR): -0.206,
+    (Sign.LOG_DENSITY, Sign.SIZE): -0.385,
+    (Sign.LOG_DENSITY, Sign.PIERCED_AROUND): 0.690,
+    (Sign.LOG_DENSITY, Sign.PIERCED_NEAR): -1.693,
+    (Sign.LOG_DENSITY, Sign.STANDING_SHARE): 1.222,
+    (Sign.AWAY, Sign.SIZE): -0.149,
+    (Sign.AWAY, Sign.PIERCED_AROUND): 0.106,
+    (Sign.AWAY, Sign.HELD): 0.516,
+    (Sign.SIZE, Sign.PIERCED_AROUND): 1.295,
+    (Sign.SIZE, Sign.THICKNESS_AROUND): 0.023,
+    (Sign.SIZE, Sign.LOG_HELD_NEAR): 0.174,
+    (Sign.HELD_SHARE, Sign.PIERCED_HELD): -6.164,
+    (Sign.HELD_SHARE, Sign.HELD_SHARE): 2.336,
+    (Sign.STANDING_SHARE, Sign.PIERCED_AROUND): -3.479,
+    (Sign.STANDING_SHARE, Sign.STANDING_SHARE): -5.655,
+    (Sign.THICKNESS_NEAR, Sign.THICKNESS_NEAR): 8.021,
+}
+"""Weights of products of two signs. A sign says less or more beside another one: leaves of a tree over a roof."""
 
 
 class _Count(IntEnum):
@@ -190,8 +176,9 @@ LEAST_CHANCE = 0.42
 """Chance from which a point is building. The IoU of a whole is largest where points count from IoU / (1 + IoU) on:
 0.42 to 0.45 at an IoU of 0.72 to 0.82, which the sparsest surveys reach."""
 _LEAST_LOGIT = math.log(LEAST_CHANCE / (1.0 - LEAST_CHANCE))
-_WEIGHTS, _PAIRS = np.array(WEIGHTS), np.array(PRODUCTS, np.int64)
-_SIGNS, _TERMS, _COUNTS = len(Sign), len(Sign) + len(PRODUCTS), len(_Count)
+_WEIGHTS = np.array((*SIGN_WEIGHTS.values(), *PRODUCT_WEIGHTS.values()))
+_PAIRS = np.array(tuple(PRODUCT_WEIGHTS), np.int64)
+_SIGNS, _TERMS, _COUNTS = len(SIGN_WEIGHTS), len(_WEIGHTS), len(_Count)
 
 
 class SparsePoints(NamedTuple):
@@ -264,7 +251,7 @@ def _count_neighbour(
 
 @kernel
 def _thickness_m(s: IntArray) -> float:
-    """Standard deviation across the plane that fits a band best, metres, at most 0.6."""
+    """Standard deviation across the plane that fits a band best, metres, at most `MAX_THICKNESS_M`."""
     n = s[0]
     if n < FEWEST_IN_BAND:
         return UNKNOWN_THICKNESS_M
@@ -277,7 +264,7 @@ def _thickness_m(s: IntArray) -> float:
         s[8] / n - my * mz,
         s[9] / n - mz * mz,
     )
-    return min(math.sqrt(across) / 1000.0, 0.6)
+    return min(math.sqrt(across) / 1000.0, MAX_THICKNESS_M)
 
 
 @kernel
@@ -286,7 +273,7 @@ def _weigh(
 ) -> None:
     """The terms of one point, from what lies around it, and the thickness of the bands within 3 m and 6 m."""
     standing = max(count[_Count.STANDING_AROUND], 1)
-    height = math.log(min(max(height_mm, 500), 40_000) / 4000.0)
+    height = math.log(min(max(height_mm, MIN_HEIGHT_MM), MAX_HEIGHT_MM) / TYPICAL_HEIGHT_MM)
     t[Sign.HELD_SHARE] = count[_Count.HELD_AROUND] / standing
     t[Sign.PIERCED_AROUND] = count[_Count.PIERCED_AROUND] / standing
     t[Sign.PIERCED_NEAR] = count[_Count.PIERCED_NEAR] / max(count[_Count.STANDING_NEAR], 1)
@@ -302,7 +289,7 @@ def _weigh(
     t[Sign.STANDING_SHARE] = count[_Count.STANDING_FAR] / max(count[_Count.ALL_FAR], 1)
     t[Sign.GROUND_SHARE] = count[_Count.GROUND_NEAR] / max(count[_Count.ALL_NEAR], 1)
     t[Sign.THICKNESS_NEAR] = thick[0]
-    t[Sign.UNDER] = min(count[_Count.TOP_NEAR], 10_000) / 1000.0
+    t[Sign.UNDER] = min(count[_Count.TOP_NEAR], MAX_UNDER_MM) / 1000.0
     t[Sign.HELD] = held
     t[Sign.SIZE] = math.log(1.0 + count[_Count.HELD_FAR])
     t[Sign.AWAY] = min(math.sqrt(float(count[_Count.NEAREST])), HELD_CLEAR_MM) / 1000.0
@@ -342,10 +329,10 @@ def terms_of(points: SparsePoints, wanted: BoolArray) -> FloatArray:
 @kernel
 def _logits(terms: FloatArray) -> FloatArray:
     """Weighted sums (n,) of terms (n, T), each in the order of the terms."""
-    out = np.full(terms.shape[0], _WEIGHTS[0])
+    out = np.full(terms.shape[0], CHANCE_LOGIT)
     for i in range(terms.shape[0]):
         for k in range(terms.shape[1]):
-            out[i] += _WEIGHTS[1 + k] * terms[i, k]
+            out[i] += _WEIGHTS[k] * terms[i, k]
     return out
 
 

@@ -28,45 +28,47 @@ from pipeline.roof.lines import Run, corners
 
 # The thresholds below describe what walls, eaves and their surroundings look like in a survey; `outline = "walls"` is
 # one switch, and they are not known for a tile.
-_MIN_LENGTH_M = 2.0
+_MIN_LINE_M = 2.0
 """A shorter line takes the mean overhang."""
 _STRIP_M = 1.0
 """Length of the strips along a line in which the eave's height is taken."""
 _EAVE_DEPTH_M = 1.2
 """The lowest roof point within this of the line is the eave."""
-_END_M = 0.3
+_END_MARGIN_M = 0.3
 """Left out at either end of a line: there the next wall begins."""
-_WIDEST_M = 1.0
+_MAX_OVERHANG_M = 1.0
 """The widest overhang."""
-_OUTSIDE_M = 0.5
+_OUTSIDE_EAVE_M = 0.5
 """Points as far outside the eave are looked at too: where most are there, they are plants, not a wall."""
 _SHEET_M = 0.3
 """Thickness of a facade with its reliefs, as several strips of a survey show it."""
-_OWN_SIGMA_M = _SHEET_M / math.sqrt(12.0)
+_WALL_VARIANCE_M2 = _SHEET_M**2 / 12.0
+_WALL_SIGMA_M = math.sqrt(_WALL_VARIANCE_M2)
 """Standard error of one wall: that of a uniform distribution as wide as its sheet."""
-_UNDER_EAVE_M = 0.5
+_MIN_BELOW_EAVE_M = 0.5
 """Gutters and soffits hang no lower."""
-_ABOVE_GROUND_M = 1.0
+_MIN_HEIGHT_M = 1.0
 """Lower points are steps, fences and cars."""
-_SPREAD_M = 1.5
+_MIN_SHEET_HEIGHT_M = 1.5
 """Least height of a sheet."""
-_FEWEST = 8
+_MIN_SHEET_POINTS = 8
 """Least number of points of a sheet."""
-_SHARE = 0.5
+_MIN_SHEET_SHARE = 0.5
 """Least share of the points beneath and before the eave in the sheet."""
-_OCCUPIED = 0.25
+_MIN_OCCUPIED_SHARE = 0.25
 """Least share of the strips with points of the sheet."""
-_SLACK_M = 0.1
+_MAX_OUTSIDE_M = 0.1
 """A sheet as far outside the eave still is the wall beneath it: outlines err by as much."""
-_BEFORE_M = (0.2, 1.5)
-"""Where open ground before a line is looked for."""
-_OPEN_HEIGHT_M = 1.5
+_OPEN_FROM_M = 0.2
+_OPEN_TO_M = 1.5
+"""Strip before a line in which open ground is searched for."""
+_MAX_OPEN_HEIGHT_M = 1.5
 """Points as low above the terrain are open ground."""
-_OPEN_SHARE = 0.5
+_MIN_OPEN_SHARE = 0.5
 """Least share of the strips with such points."""
-_CORNER_REACH_M = 2.0
+_MAX_CORNER_REACH_M = 2.0
 """Lines that meet farther than this from their corner at the eaves are joined by a step there."""
-_MAX_MOVED = 1.5
+_MAX_CHANGE_PER_SWEPT = 1.5
 """Most area between eaves and walls, as a multiple of what the lines sweep."""
 _ROUNDING_MM2 = 1e4
 """Added to it: what rounding to 1 mm changes along 10 m."""
@@ -147,7 +149,7 @@ def eave_of(start: FloatArray, end: FloatArray, points: FacadePoints, reach_m: f
     reach. The overhang is slightly negative where the outline was drawn a little inside the wall.
     """
     length = math.dist(start, end)
-    if length < _MIN_LENGTH_M:
+    if length < _MIN_LINE_M:
         return Eave(length_m=length, is_open=True, overhang_m=None)
     (x0, y0), (ux, uy) = start.tolist(), ((end - start) / length).tolist()
     out = np.array([uy, -ux])
@@ -169,14 +171,14 @@ def eave_of(start: FloatArray, end: FloatArray, points: FacadePoints, reach_m: f
     eave_z = np.full(strips, np.inf)
     np.minimum.at(eave_z, strip, points.roof[index, 2])
     eave_z[np.isinf(eave_z)] = eave_z.min()
-    index, way, off, strip = near(points.tree, points.xyz, _WIDEST_M + _SHEET_M, _BEFORE_M[1])
+    index, way, off, strip = near(points.tree, points.xyz, _MAX_OVERHANG_M + _SHEET_M, _OPEN_TO_M)
     z, height = points.xyz[index, 2], points.height_m[index]
     off = off + reach_m * points.later[index]
-    open_strips = np.unique(strip[(off > _BEFORE_M[0]) & (height < _OPEN_HEIGHT_M)])
-    if len(open_strips) < _OPEN_SHARE * strips:
+    open_strips = np.unique(strip[(off > _OPEN_FROM_M) & (height < _MAX_OPEN_HEIGHT_M)])
+    if len(open_strips) < _MIN_OPEN_SHARE * strips:
         return Eave(length_m=length, is_open=False, overhang_m=None)
-    beneath = (off < _OUTSIDE_M) & (z < eave_z[strip] - _UNDER_EAVE_M) & (height > _ABOVE_GROUND_M)
-    beneath &= (way > _END_M) & (way < length - _END_M)
+    beneath = (off < _OUTSIDE_EAVE_M) & (z < eave_z[strip] - _MIN_BELOW_EAVE_M) & (height > _MIN_HEIGHT_M)
+    beneath &= (way > _END_MARGIN_M) & (way < length - _END_MARGIN_M)
     overhang_m = _overhang_of_sheet(off[beneath], strip[beneath], z[beneath], strips)
     return Eave(length_m=length, is_open=True, overhang_m=overhang_m)
 
@@ -186,19 +188,20 @@ def _overhang_of_sheet(off: FloatArray, strip: IntArray, z: FloatArray, strips: 
 
     `off` is the points' distance to the right of the line, `strip` where along it they are.
     """
-    if len(off) < _FEWEST:
+    if len(off) < _MIN_SHEET_POINTS:
         return None
     order = np.lexsort((z, strip, off))
     off, strip, z = off[order], strip[order], z[order]
     counts = np.searchsorted(off, off + _SHEET_M, side="right") - np.arange(len(off))
     first = int(np.argmax(counts))
     sheet = slice(first, first + int(counts[first]))
-    if counts[first] < max(_FEWEST, _SHARE * len(off)) or float(np.ptp(z[sheet])) < _SPREAD_M:
+    fewest = max(_MIN_SHEET_POINTS, _MIN_SHEET_SHARE * len(off))
+    if counts[first] < fewest or float(np.ptp(z[sheet])) < _MIN_SHEET_HEIGHT_M:
         return None
-    if len(np.unique(strip[sheet])) < _OCCUPIED * strips:
+    if len(np.unique(strip[sheet])) < _MIN_OCCUPIED_SHARE * strips:
         return None
     overhang = -float(np.median(off[sheet]))
-    return min(overhang, _WIDEST_M) if overhang >= -_SLACK_M else None
+    return min(overhang, _MAX_OVERHANG_M) if overhang >= -_MAX_OUTSIDE_M else None
 
 
 def mean_overhang(eaves: Sequence[Eave]) -> tuple[float, float]:
@@ -211,8 +214,7 @@ def mean_overhang(eaves: Sequence[Eave]) -> tuple[float, float]:
         return math.nan, math.nan
     whole = math.fsum(length for length, _ in known)
     mean = math.fsum(length * over for length, over in known) / whole
-    own = _SHEET_M**2 / 12.0
-    variance = math.fsum(length**2 * (own + (over - mean) ** 2) for length, over in known) / whole**2
+    variance = math.fsum(length**2 * (_WALL_VARIANCE_M2 + (over - mean) ** 2) for length, over in known) / whole**2
     return max(0.0, mean), math.sqrt(variance)
 
 
@@ -250,7 +252,7 @@ def walls_beneath(
     ways_m, counted_m = [], []
     for eaves in eaves_of:
         ways = [e.overhang_m if e.overhang_m is not None else mean_m if e.is_open else 0.0 for e in eaves]
-        least = [max(least_m, mean_sigma_m if e.overhang_m is None else _OWN_SIGMA_M) for e in eaves]
+        least = [max(least_m, mean_sigma_m if e.overhang_m is None else _WALL_SIGMA_M) for e in eaves]
         ways_m.append(ways)
         counted_m.append([way if way >= enough else 0.0 for way, enough in zip(ways, least, strict=True)])
 
@@ -344,7 +346,7 @@ def moved_line_by_line(ring: FloatArray, ways_m: Sequence[float]) -> FloatArray:
                 length=math.hypot(x1 - x0, y1 - y0),
             )
         )
-    places = Polygon(corners(ring, runs, 1e3 * _CORNER_REACH_M, closed=True))
+    places = Polygon(corners(ring, runs, 1e3 * _MAX_CORNER_REACH_M, closed=True))
     if places.exterior.is_ccw != Polygon(ring).exterior.is_ccw:
         return ring  # turned inside out: narrower than its overhangs
     sound = shapely.make_valid(places, method="structure", keep_collapsed=False)
@@ -353,7 +355,7 @@ def moved_line_by_line(ring: FloatArray, ways_m: Sequence[float]) -> FloatArray:
         return ring
     largest = Polygon(max(parts, key=lambda part: part.area).exterior)
     swept = math.fsum(run.length * 1e3 * abs(way_m) for run, way_m in zip(runs, ways_m, strict=True))
-    if shapely.symmetric_difference(largest, Polygon(ring)).area > _MAX_MOVED * swept + _ROUNDING_MM2:
+    if shapely.symmetric_difference(largest, Polygon(ring)).area > _MAX_CHANGE_PER_SWEPT * swept + _ROUNDING_MM2:
         return ring
     drawn: FloatArray = shapely.get_coordinates(largest.exterior)[:-1]
     return drawn

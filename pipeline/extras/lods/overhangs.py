@@ -18,6 +18,7 @@ import itertools
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import shapely
@@ -30,13 +31,30 @@ from pipeline.roof.extrusion import MIN_SPAN_MM, SAME_HEIGHT_MM
 from pipeline.roof.footprint import polygons_of
 from pipeline.roof.solid import SolidPart
 
-_FORMS = ((10.0, 0, 2.0), (10.0, 7, 2.0), (30.0, 0, 5.0), (30.0, -7, 10.0), (100.0, 7, 10.0))
-"""Ways to draw the same: how far the wall outline may move to a border or vertex of the roof; what is added to the
-thickness, for undersides that touch a roof along an edge; how near new vertices of the plan are to others that take
-their place. All mm; the first whose solid is valid is delivered."""
-_NARROW_MM = 20.0
+
+class _Form(NamedTuple):
+    """One way to draw the same overhangs, in millimetres."""
+
+    snap_mm: float
+    """How far the wall outline may move to a border or vertex of the roof."""
+    thicker_mm: int
+    """Added to the thickness: undersides may otherwise touch a roof along an edge."""
+    unite_mm: float
+    """How near a new vertex of the plan is to another that takes its place."""
+
+
+_FORMS = (
+    _Form(snap_mm=10.0, thicker_mm=0, unite_mm=2.0),
+    _Form(snap_mm=10.0, thicker_mm=7, unite_mm=2.0),
+    _Form(snap_mm=30.0, thicker_mm=0, unite_mm=5.0),
+    _Form(snap_mm=30.0, thicker_mm=-7, unite_mm=10.0),
+    _Form(snap_mm=100.0, thicker_mm=7, unite_mm=10.0),
+)
+"""Tried from the most exact on; the first whose solid is valid is delivered. 7 mm exceed
+`SAME_HEIGHT_MM`, within which heights are one."""
+_STRIP_HALF_WIDTH_MM = 20.0
 """Half the width of strips between eaves and walls that are not overhangs: outlines are simplified by as much."""
-_MIN_APART_MM = 2.0
+_MIN_VERTEX_DISTANCE_MM = 2.0
 """Vertices of the plan are at least this far apart, so that no reader takes two for one."""
 _STRAIGHT_MM = 1.5
 """A vertex this near to the line between its neighbours is idle: rounding to 1 mm moves a point on it as far."""
@@ -84,7 +102,7 @@ def overhanging_solids(
         part has an underside above `lowest_m`.
     """
     plan = shapely.transform(np.array([part.footprint for part in parts], object), lambda xy: np.rint(xy * 1e3))
-    if shapely.is_empty(shapely.buffer(shapely.difference(plan, walls_mm), -_NARROW_MM)).all():
+    if shapely.is_empty(shapely.buffer(shapely.difference(plan, walls_mm), -_STRIP_HALF_WIDTH_MM)).all():
         raise UndrawableError(NoOverhang.WALLS_BREAK, "the outline breaks where it is drawn back to the walls")
     solids = []
     hangs = False
@@ -118,10 +136,10 @@ def _sound_solid(
 ) -> Solid:
     """The first sound form of one part."""
     faults: list[str] = []
-    for snap_mm, more_mm, unite_mm in _FORMS:
+    for form in _FORMS:
         try:
-            drawn = _Overhangs(part, planes, thickness_mm + more_mm)
-            drawn.cut(walls_mm, snap_mm, unite_mm)
+            drawn = _Overhangs(part, planes, thickness_mm + form.thicker_mm)
+            drawn.cut(walls_mm, form.snap_mm, form.unite_mm)
             solid = drawn.solid(lowest_mm)
         except (BuildingError, shapely.errors.GEOSException) as error:
             faults.append(str(error))
@@ -212,7 +230,7 @@ class _Overhangs:
                 rings.append([self._vertex((x, y)) for x, y in corners])
             self._cells.append(_Cell(min(over), tuple(rings)))
             self._is_inside.append(bool(shapely.intersects(walls, place)))
-        if _closest(self._xy, self._count) < _MIN_APART_MM:
+        if _closest(self._xy, self._count) < _MIN_VERTEX_DISTANCE_MM:
             raise _fault("vertices of walls and roof are too close to one another")
         self._find_tops()
 

@@ -13,12 +13,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from pipeline.compiler import kernel
 from pipeline.errors import BuildingError
 from pipeline.extras.papers.clustering_settings import FuzzySartClusteringSettings
-from pipeline.model import FloatArray, LabelArray, Reason
+from pipeline.model import FloatArray, IntArray, LabelArray, Reason
 
 _FLAT_RANGE = 1e-6
 """Ranges below this (metres or radians) count as none: scaling them would only blow up rounding."""
@@ -26,6 +25,12 @@ _ZERO_MODULE = 1e-9
 """A vector shorter than this has no direction: an outlier."""
 _NEGLIGIBLE_RANK = 12.0
 """exp(-12) is 6e-6: a neuron that far down the ranking is not moved."""
+_AT_REST = 1e-3
+"""Share of the largest module below which a template has not moved: far less than clusters are apart."""
+_ROUNDING = 1e-12
+"""Taken off a bound of cosines, so that rounding excludes no match that is just good enough."""
+_ROOM = 16
+"""Neurons that there is room for at first; the room doubles."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -160,146 +165,221 @@ class _Learning(NamedTuple):
     work_limit: int
 
 
-@kernel
-def _learn(  # noqa: C901 - the paper's algorithm in one piece: parts would be compiled apart and pass its state around
-    vectors: FloatArray,
-    order: npt.NDArray[np.int64],
-    learning: _Learning,
-) -> tuple[LabelArray, FloatArray, int, int]:
-    """Labels, templates, epochs and comparisons; stops early once the comparisons pass the limit.
+class _Vectors(NamedTuple):
+    """The vectors that are clustered."""
 
-    It stays whole: its arrays grow as neurons are made, so that parts of it would pass all of them to and fro.
-    """
-    vigilance, tau, max_epochs, rate_start, rate_end, reach_start, reach_end, work_limit = learning
-    n = vectors.shape[0]
-    module = np.empty(n)
-    largest = 0.0
-    for i in range(n):
-        module[i] = math.sqrt(
-            vectors[i, 0] * vectors[i, 0] + vectors[i, 1] * vectors[i, 1] + vectors[i, 2] * vectors[i, 2]
+    xyz: FloatArray
+    """(n, 3) float64."""
+    module: FloatArray
+    """(n,) float64, their lengths."""
+
+
+class _Neurons(NamedTuple):
+    """The neurons, and room for more; arrays of one length."""
+
+    template: FloatArray
+    """(room, 3) float64."""
+    module: FloatArray
+    """(room,) float64, lengths of the templates."""
+    before: FloatArray
+    """(room, 3) float64, the templates at the start of the epoch."""
+    age: IntArray
+    """(room,) int64, epochs lived."""
+    hits: IntArray
+    """(room,) int64, vectors won in this epoch."""
+
+
+class _Bounds(NamedTuple):
+    """Matches that count."""
+
+    vigilance: float
+    min_cosine: float
+    """Cosine of an angle beyond which no match reaches the vigilance: its arc cosine need not be taken."""
+
+
+class _Ranking(NamedTuple):
+    """The neurons that match one vector, the best first; equal ones in their order."""
+
+    neuron: IntArray
+    """(room,) int64."""
+    degree: FloatArray
+    """(room,) float64."""
+
+
+@kernel
+def _with_modules(xyz: FloatArray) -> _Vectors:
+    """Vectors (n, 3) with their lengths."""
+    module = np.empty(len(xyz))
+    for i in range(len(xyz)):
+        module[i] = math.sqrt(xyz[i, 0] * xyz[i, 0] + xyz[i, 1] * xyz[i, 1] + xyz[i, 2] * xyz[i, 2])
+    return _Vectors(xyz, module)
+
+
+@kernel
+def _no_neurons(room: int) -> _Neurons:
+    """Room for neurons."""
+    return _Neurons(
+        np.zeros((room, 3)), np.zeros(room), np.zeros((room, 3)), np.zeros(room, np.int64), np.zeros(room, np.int64)
+    )
+
+
+@kernel
+def _with_neuron(neurons: _Neurons, count: int, vectors: _Vectors, i: int) -> _Neurons:
+    """The `count` neurons and one made from a vector; in arrays twice as long where there was no room."""
+    if count == len(neurons.age):
+        wider = _no_neurons(2 * count)
+        wider.template[:count] = neurons.template
+        wider.module[:count] = neurons.module
+        wider.before[:count] = neurons.before
+        wider.age[:count] = neurons.age
+        wider.hits[:count] = neurons.hits
+        neurons = wider
+    neurons.template[count] = vectors.xyz[i]
+    neurons.module[count] = vectors.module[i]
+    neurons.age[count] = 0
+    neurons.hits[count] = 1
+    return neurons
+
+
+@kernel
+def _ranked(neurons: _Neurons, count: int, vectors: _Vectors, i: int, bounds: _Bounds, ranking: _Ranking) -> int:
+    """Write the neurons that match a vector to the ranking; how many there are."""
+    matches = 0
+    for k in range(count):
+        match = _degree(neurons.template, neurons.module, k, vectors, i, bounds)
+        if match >= bounds.vigilance:
+            at = matches
+            while at > 0 and ranking.degree[at - 1] < match:
+                ranking.degree[at] = ranking.degree[at - 1]
+                ranking.neuron[at] = ranking.neuron[at - 1]
+                at -= 1
+            ranking.degree[at] = match
+            ranking.neuron[at] = k
+            matches += 1
+    return matches
+
+
+@kernel
+def _move_towards(xyz: FloatArray, neurons: _Neurons, ranked: IntArray, learning: _Learning) -> None:
+    """Move the ranked neurons towards a vector (3,); those of a low rank or a high age move less."""
+    template, age, tau = neurons.template, neurons.age, learning.tau
+    winner = ranked[0]
+    neurons.hits[winner] += 1
+    reach = learning.reach_start * (learning.reach_end / learning.reach_start) ** min(1.0, age[winner] / tau)
+    for rank in range(len(ranked)):
+        fading = rank / reach
+        if fading > _NEGLIGIBLE_RANK:
+            break
+        k = ranked[rank]
+        rate = (
+            learning.rate_start
+            * (learning.rate_end / learning.rate_start) ** min(1.0, age[k] / tau)
+            * math.exp(-fading)
         )
-        largest = max(largest, module[i])
-    capacity = 16
-    template = np.zeros((capacity, 3))
-    template_module = np.zeros(capacity)
-    before = np.zeros((capacity, 3))
-    age = np.zeros(capacity, np.int64)
-    hits = np.zeros(capacity, np.int64)
-    ranked = np.zeros(capacity, np.int64)
-    degree = np.zeros(capacity)
-    # An angle beyond pi (1 - V) cannot reach the vigilance: its arc cosine need not be taken.
-    min_cosine = math.cos(math.pi * (1.0 - vigilance)) - 1e-12
-    count = 0
-    work = 0
-    epochs = 0
-    for _ in range(max_epochs):
-        hits[:count] = 0
-        before[:count] = template[:count]
-        count_before = count
-        made = False
-        for i in order:
-            if module[i] < _ZERO_MODULE:
-                continue
-            work += count + 1
-            matches = 0
-            for k in range(count):
-                match = _degree(template, template_module, k, vectors, module, i, min_cosine, vigilance)
-                if match >= vigilance:
-                    at = matches
-                    while at > 0 and degree[at - 1] < match:
-                        degree[at] = degree[at - 1]
-                        ranked[at] = ranked[at - 1]
-                        at -= 1
-                    degree[at] = match
-                    ranked[at] = k
-                    matches += 1
-            if matches == 0:
-                if count == capacity:
-                    template = np.concatenate((template, np.zeros((capacity, 3))))
-                    template_module = np.concatenate((template_module, np.zeros(capacity)))
-                    before = np.concatenate((before, np.zeros((capacity, 3))))
-                    age = np.concatenate((age, np.zeros(capacity, np.int64)))
-                    hits = np.concatenate((hits, np.zeros(capacity, np.int64)))
-                    ranked = np.concatenate((ranked, np.zeros(capacity, np.int64)))
-                    degree = np.concatenate((degree, np.zeros(capacity)))
-                    capacity *= 2
-                template[count] = vectors[i]
-                template_module[count] = module[i]
-                age[count] = 0
-                hits[count] = 1
-                count += 1
-                made = True
-                continue
-            winner = ranked[0]
-            hits[winner] += 1
-            reach = reach_start * (reach_end / reach_start) ** min(1.0, age[winner] / tau)
-            for rank in range(matches):
-                fading = rank / reach
-                if fading > _NEGLIGIBLE_RANK:
-                    break
-                k = ranked[rank]
-                rate = rate_start * (rate_end / rate_start) ** min(1.0, age[k] / tau) * math.exp(-fading)
-                square = 0.0
-                for d in range(3):
-                    template[k, d] += rate * (vectors[i, d] - template[k, d])
-                    square += template[k, d] * template[k, d]
-                template_module[k] = math.sqrt(square)
-        epochs += 1
-        if work > work_limit:
-            break
-        moved = 0.0
-        removed = False
-        grown = True
-        kept = 0
-        for k in range(count):
-            if k < count_before:
-                for d in range(3):
-                    moved = max(moved, abs(template[k, d] - before[k, d]))
-            if hits[k] == 0:
-                removed = True
-                continue
-            template[kept] = template[k]
-            template_module[kept] = template_module[k]
-            age[kept] = age[k] + 1
-            grown = grown and age[kept] > tau
-            kept += 1
-        count = kept
-        if not made and not removed and grown and moved < 1e-3 * largest:
-            break
-    labels = np.full(n, -1, np.int32)
-    if work > work_limit:
-        return labels, template[:count].copy(), epochs, work
-    for i in range(n):
-        if module[i] < _ZERO_MODULE:
+        square = 0.0
+        for d in range(3):
+            template[k, d] += rate * (xyz[d] - template[k, d])
+            square += template[k, d] * template[k, d]
+        neurons.module[k] = math.sqrt(square)
+
+
+@kernel
+def _end_epoch(neurons: _Neurons, count: int, count_before: int, tau: int) -> tuple[int, float, bool]:
+    """Remove the neurons that won nothing, and let the others age.
+
+    Returns how many are left, how far those moved that were there at the start, and whether all have lived `tau`
+    epochs and none was removed.
+    """
+    moved = 0.0
+    settled = True
+    kept = 0
+    for k in range(count):
+        if k < count_before:
+            for d in range(3):
+                moved = max(moved, abs(neurons.template[k, d] - neurons.before[k, d]))
+        if neurons.hits[k] == 0:
+            settled = False
             continue
-        best = vigilance
+        neurons.template[kept] = neurons.template[k]
+        neurons.module[kept] = neurons.module[k]
+        neurons.age[kept] = neurons.age[k] + 1
+        settled = settled and neurons.age[kept] > tau
+        kept += 1
+    return kept, moved, settled
+
+
+@kernel
+def _labelled(vectors: _Vectors, neurons: _Neurons, count: int, bounds: _Bounds) -> LabelArray:
+    """The neuron that matches each vector best, (n,) int32; -1 where none does."""
+    labels = np.full(len(vectors.module), -1, np.int32)
+    for i in range(len(labels)):
+        if vectors.module[i] < _ZERO_MODULE:
+            continue
+        best = bounds.vigilance
         for k in range(count):
-            match = _degree(template, template_module, k, vectors, module, i, min_cosine, vigilance)
+            match = _degree(neurons.template, neurons.module, k, vectors, i, bounds)
             if match > best or (match == best and labels[i] < 0):
                 best = match
                 labels[i] = k
-    return labels, template[:count].copy(), epochs, work
+    return labels
 
 
 @kernel
+def _learn(
+    xyz: FloatArray,
+    order: IntArray,
+    learning: _Learning,
+) -> tuple[LabelArray, FloatArray, int, int]:
+    """Labels, templates, epochs and comparisons; stops early once the comparisons pass the limit."""
+    vectors = _with_modules(xyz)
+    largest = 0.0
+    for i in range(len(xyz)):
+        largest = max(largest, vectors.module[i])
+    bounds = _Bounds(learning.vigilance, math.cos(math.pi * (1.0 - learning.vigilance)) - _ROUNDING)
+    neurons = _no_neurons(_ROOM)
+    # in an epoch each vector keeps at most one neuron alive and makes at most one
+    most = 2 * len(xyz)
+    ranking = _Ranking(np.zeros(most, np.int64), np.zeros(most))
+    count = 0
+    work = 0
+    epochs = 0
+    for _ in range(learning.max_epochs):
+        neurons.hits[:count] = 0
+        neurons.before[:count] = neurons.template[:count]
+        count_before = count
+        made = False
+        for i in order:
+            if vectors.module[i] < _ZERO_MODULE:
+                continue
+            work += count + 1
+            matches = _ranked(neurons, count, vectors, i, bounds, ranking)
+            if matches == 0:
+                neurons = _with_neuron(neurons, count, vectors, i)
+                count += 1
+                made = True
+            else:
+                _move_towards(xyz[i], neurons, ranking.neuron[:matches], learning)
+        epochs += 1
+        if work > learning.work_limit:
+            return np.full(len(xyz), -1, np.int32), neurons.template[:count].copy(), epochs, work
+        count, moved, settled = _end_epoch(neurons, count, count_before, learning.tau)
+        if settled and not made and moved < _AT_REST * largest:
+            break
+    return _labelled(vectors, neurons, count, bounds), neurons.template[:count].copy(), epochs, work
+
+
+@kernel(inline="always")
 def _degree(
-    template: FloatArray,
-    template_module: FloatArray,
-    k: int,
-    vectors: FloatArray,
-    module: FloatArray,
-    i: int,
-    min_cosine: float,
-    vigilance: float,
+    template: FloatArray, template_module: FloatArray, k: int, vectors: _Vectors, i: int, bounds: _Bounds
 ) -> float:
     """VDM of neuron k and vector i (Eq. 3), or -1 where it is certain to stay below the vigilance."""
     # Both bounds are tested by multiplication first: nearly all comparisons end here.
-    t_module = template_module[k]
-    x_module = module[i]
-    if t_module < _ZERO_MODULE or min(t_module, x_module) < vigilance * max(t_module, x_module):
+    t_module, x_module = template_module[k], vectors.module[i]
+    if t_module < _ZERO_MODULE or min(t_module, x_module) < bounds.vigilance * max(t_module, x_module):
         return -1.0
-    dot = template[k, 0] * vectors[i, 0] + template[k, 1] * vectors[i, 1] + template[k, 2] * vectors[i, 2]
+    xyz = vectors.xyz
+    dot = template[k, 0] * xyz[i, 0] + template[k, 1] * xyz[i, 1] + template[k, 2] * xyz[i, 2]
     modules = t_module * x_module
-    if dot < min_cosine * modules:
+    if dot < bounds.min_cosine * modules:
         return -1.0
     return float(_module_degree(t_module, x_module) * _angle_degree(dot / modules))

@@ -21,10 +21,15 @@ from pipeline.roof.arrangement.raster_labels import Raster, vertical_distance_m
 _MIN_SLOPE = 0.08
 """Difference of slopes below which two planes cross nowhere exactly: their noise moves the line by metres."""
 _NEAR_CROSSING_CELLS = 1.2
-_NEAR_CROSSING_M = 0.1
 """A place this near to the planes' crossing belongs to it: labels are no finer than a cell."""
+_MAX_CROSSING_CELLS = 4.0
+"""Farthest such place where planes differ so little that the points do not show their side; others are steps."""
+_NOISE_M = 0.1
+"""Added to distances in cells: where cells are small, the noise of the points decides where a border lies."""
 _BAND_CELLS = 1.1
 """Width of the band in which the places of one step lie, by the resolution of the labels."""
+_SHIFT_CELLS = 0.6
+"""How far a step may move from the middle of its band: little more than half its width."""
 _CROSSING_BONUS = 1.5
 """A crossing comes before a step with as many places, since its position is exact. Decides only an order."""
 _MIN_EDGE_M = 1.0
@@ -33,10 +38,14 @@ _SAME_DIRECTION_RAD = math.radians(3.0)
 """Directions closer than this are one: over a few metres they differ by less than a cell."""
 _SEARCH_M = 1.0
 """How far from a step the points are that decide its position."""
-_MIN_POINTS = 4
+_MIN_STEP_POINTS = 4
 """Fewer points do not show where a step is."""
 _MAX_DIRECTIONS = 24
 """Bounds the work for outlines with very many edges; the longest come first."""
+_DIRECTIONS_OF_PLANES = 4
+"""Room for the fall lines and contours of two planes."""
+_ROUNDING = 1e-9
+"""Costs and distances (metres) closer than this are equal: their last bits depend on the order of sums."""
 
 
 class CandidateLines(NamedTuple):
@@ -182,7 +191,7 @@ def _parting_shift(
         offsets[m] = off
         gains[m] = (min(to_one, cap_m) - min(to_other, cap_m)) / cap_m
         m += 1
-    if m < _MIN_POINTS:
+    if m < _MIN_STEP_POINTS:
         return math.nan
     order = ascending_order(offsets[:m])
     total = 0.0
@@ -198,7 +207,7 @@ def _parting_shift(
             continue
         # one plane below the line and the other above it, or the other way round
         cost = min(below, total - below)
-        if cost < least - 1e-9 or (cost <= least + 1e-9 and abs(shift) < abs(best)):
+        if cost < least - _ROUNDING or (cost <= least + _ROUNDING and abs(shift) < abs(best)):
             least = cost
             best = shift
     return best
@@ -249,7 +258,7 @@ def candidate_lines(
     crossing = np.zeros(m + 1, np.int32)
     line_of = np.full(m, -1, np.int32)
     outline = _outline_directions(edges)
-    directions = np.empty(len(outline) + 4)
+    directions = np.empty(len(outline) + _DIRECTIONS_OF_PLANES)
     difference = np.empty(3)
     n_lines = 0
     first = 0
@@ -264,7 +273,7 @@ def candidate_lines(
         turn = math.hypot(difference[0], difference[1])
         if turn > _MIN_SLOPE:
             # where the planes differ by less than the cap the points do not show on which side they are
-            near_m = max(_NEAR_CROSSING_CELLS * cell_m + _NEAR_CROSSING_M, min(cap_m / turn, 4.0 * cell_m))
+            near_m = max(_NEAR_CROSSING_CELLS * cell_m + _NOISE_M, min(cap_m / turn, _MAX_CROSSING_CELLS * cell_m))
             on_line = _take_places(places, first, last, difference, near_m * turn, line_of, n_lines)
             if on_line >= least:
                 for axis in range(3):
@@ -289,12 +298,12 @@ def candidate_lines(
             low, high = math.inf, -math.inf
             for q in range(first, last):
                 off = line[0] * places[q, 0] + line[1] * places[q, 1] + line[2]
-                if line_of[q] < 0 and abs(off) <= 0.5 * _BAND_CELLS * cell_m + 1e-9:
+                if line_of[q] < 0 and abs(off) <= 0.5 * _BAND_CELLS * cell_m + _ROUNDING:
                     line_of[q] = n_lines
                     free -= 1
                     along = -line[1] * places[q, 0] + line[0] * places[q, 1]
                     low, high = min(low, along), max(high, along)
-            reach_m = 0.6 * cell_m + _NEAR_CROSSING_M
+            reach_m = _SHIFT_CELLS * cell_m + _NOISE_M
             half = 0.5 * cell_m
             shift = _parting_shift(points, planes, (one, other), line, low - half, high + half, cap_m, reach_m)
             if not math.isnan(shift):

@@ -64,17 +64,21 @@ class HeightsAround(NamedTuple):
 
 _AROUND_M = 0.75
 """Points at least this near to a corner count as around it: they show how high a roof may be there."""
-_FAR_SIDES = 3.0
-"""Sides of a cell of the raster within which points are looked for where there are none nearer."""
-_STEEPEST = 1.0
+_NEAR_RINGS, _FAR_RINGS = 1, 2
+"""Rings of cells around a place in which points are searched for: the far ones where the near ones are empty."""
+_FAR_SIDES = _FAR_RINGS + 1.0
+"""Sides of a cell within which all far rings lie."""
+_MAX_CONTINUED_SLOPE = 1.0
 """Planes that are steeper go on no farther beyond their points than one of this slope."""
 _COST_PER_M = 20.0
 _MAX_COST = 40.0
 """Points that a plane costs per metre, and at most: more than a face, less than a large cell holds."""
+_SAME_SLOPE = 1e-6
+"""Planes whose slopes differ by less meet nowhere near."""
 _STEP_MM = 250.0
 """Step along an edge: a third of the raster's cells, which have no finer heights."""
-_MAX_LEVEL = 8
-"""Horizontal planes added at a time: a roof with more places where nothing fits is not made of planes."""
+_MAX_LEVEL_PLANES = 8
+"""Most horizontal planes added at a time: a roof with more places where nothing fits is not made of planes."""
 
 
 @kernel
@@ -106,8 +110,8 @@ def _heights_at(raster: HeightsRaster, x_mm: float, y_mm: float) -> tuple[float,
     low, high, side = raster.lowest, raster.highest, raster.side
     r, c = math.floor((y_mm * 1e-3 - raster.south) / side), math.floor((x_mm * 1e-3 - raster.west) / side)
     lowest, highest, within = math.inf, -math.inf, side
-    for reach in (1, 2):
-        within = side if reach == 1 else _FAR_SIDES * side
+    for reach in (_NEAR_RINGS, _FAR_RINGS):
+        within = side if reach == _NEAR_RINGS else _FAR_SIDES * side
         for row in range(max(r - reach, 0), min(r + reach + 1, low.shape[0])):
             for column in range(max(c - reach, 0), min(c + reach + 1, low.shape[1])):
                 lowest = min(lowest, low[row, column])
@@ -144,7 +148,7 @@ def _outside_m(
     if lowest > highest:
         return 0.0
     z = plane[0] * x_mm * 1e-3 + plane[1] * y_mm * 1e-3 + plane[2]
-    slope = min(math.hypot(plane[0], plane[1]), _STEEPEST)
+    slope = min(math.hypot(plane[0], plane[1]), _MAX_CONTINUED_SLOPE)
     outside: float = max(z - highest - slope * side, 0.0) if z > highest else min(z - lowest + slope * within, 0.0)
     return outside
 
@@ -197,7 +201,7 @@ def with_level_planes(
 
     `labels` (c,) are the planes of the cells; `far_m` as in `add_costs_of_far_planes`. The given planes come first.
     """
-    extended = np.empty((len(planes) + _MAX_LEVEL, 3))
+    extended = np.empty((len(planes) + _MAX_LEVEL_PLANES, 3))
     k = len(planes)
     for q in range(k):
         for axis in range(3):
@@ -253,7 +257,7 @@ def _cut_where_planes_meet(
 ) -> None:
     """Cut a cell along the line in which two planes meet, where it crosses the cell."""
     slope = math.hypot(one[0] - other[0], one[1] - other[1])
-    if slope < 1e-6:
+    if slope < _SAME_SLOPE:
         return
     meeting = np.empty(3)
     for axis in range(3):

@@ -51,9 +51,9 @@ def _lost(
     task: BatchTask, site: CandidateSite, loss: Loss, limits: IsolationLimits, cancelled: Callable[[], bool]
 ) -> Packed:
     """The record and the bundle of a building that ended its process; also made in a child."""
-    patient = dataclasses.replace(limits, timeout_s=max(limits.timeout_s, _BUNDLE_TIMEOUT_S))
+    bundled = dataclasses.replace(limits, timeout_s=max(limits.timeout_s, _BUNDLE_TIMEOUT_S))
     describe = functools.partial(lost_site, task, loss)
-    ((_, described),) = supervise(describe, [site], patient, cancelled, second_chance=False, loads=_loads(task))
+    ((_, described),) = supervise(describe, [site], bundled, cancelled, second_chance=False, loads=_loads(task))
     if not isinstance(described, Loss):
         return described
     detail = f"{loss.detail}; {NO_BUNDLE}: {described.detail}"

@@ -8,8 +8,8 @@ import pytest
 
 from pipeline.extras.classify.point_classes import PointClass, PointEvidence, classes_of, support_m
 from pipeline.extras.classify.sparse_points import (
-    PRODUCTS,
-    WEIGHTS,
+    PRODUCT_WEIGHTS,
+    SIGN_WEIGHTS,
     Role,
     Sign,
     SparsePoints,
@@ -79,13 +79,14 @@ def test_the_terms_are_those_of_a_full_search() -> None:
     points = random_points()
     wanted = points.role > 0
     terms = terms_of(points, wanted)
-    assert terms.shape == (150, len(WEIGHTS) - 1)
+    assert list(SIGN_WEIGHTS) == list(Sign)
+    assert terms.shape == (150, len(SIGN_WEIGHTS) + len(PRODUCT_WEIGHTS))
     for i in range(150):
         if not wanted[i]:
             assert not terms[i].any()
             continue
         signs = signs_of(points, i)
-        expected = [signs[sign] for sign in Sign] + [signs[a] * signs[b] for a, b in PRODUCTS]
+        expected = [signs[sign] for sign in Sign] + [signs[a] * signs[b] for a, b in PRODUCT_WEIGHTS]
         assert terms[i] == pytest.approx(expected, abs=1e-9)
 
 
@@ -107,7 +108,7 @@ def test_order_place_and_the_other_wanted_points_change_nothing() -> None:
 
 def test_no_points_have_no_terms() -> None:
     empty = SparsePoints(*(column[:0] for column in random_points()))
-    assert terms_of(empty, np.empty(0, np.bool_)).shape == (0, len(WEIGHTS) - 1)
+    assert terms_of(empty, np.empty(0, np.bool_)).shape == (0, len(SIGN_WEIGHTS) + len(PRODUCT_WEIGHTS))
     assert len(likely_building(empty, np.empty(0, np.bool_))) == 0
 
 

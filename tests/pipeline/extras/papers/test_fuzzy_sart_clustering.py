@@ -12,7 +12,14 @@ from hypothesis import strategies as st
 
 from pipeline.errors import BuildingError, SettingsError
 from pipeline.extras.papers.clustering_settings import FuzzySartClusteringSettings
-from pipeline.extras.papers.fuzzy_sart_clusters import _degree, centre_of_building, cluster, facet_vectors
+from pipeline.extras.papers.fuzzy_sart_clusters import (
+    _Bounds,
+    _degree,
+    _Vectors,
+    centre_of_building,
+    cluster,
+    facet_vectors,
+)
 from pipeline.model import FloatArray, Reason
 
 coordinate = st.floats(-100, 100, allow_nan=False).filter(lambda value: abs(value) > 1e-3)
@@ -89,7 +96,8 @@ def noisy_normals(seed: int, count: int = 60, spread: float = 0.1) -> tuple[Floa
 def degree_of_match(template: Sequence[float], other: Sequence[float], vigilance: float = 0.0) -> float:
     """What the kernel says of one neuron and one vector."""
     t, x = np.array([template], np.float64), np.array([other], np.float64)
-    return _degree(t, np.linalg.norm(t, axis=1), 0, x, np.linalg.norm(x, axis=1), 0, -2.0, vigilance)
+    vectors = _Vectors(x, np.linalg.norm(x, axis=1))
+    return _degree(t, np.linalg.norm(t, axis=1), 0, vectors, 0, _Bounds(vigilance, -2.0))
 
 
 @settings(deadline=None)
