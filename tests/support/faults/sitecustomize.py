@@ -60,6 +60,9 @@ STAGES = {
 BUILDINGS = "pipeline.recipe"
 """The module that models one building."""
 
+GATHERING = ("pipeline.runtime.stages.model_batch", "pipeline.runtime.stages.child_batch")
+"""The modules that gather the points of buildings, in a worker itself and in its children."""
+
 URLS = "pipeline.extras.remote.urls"
 """The module with the time-out of servers."""
 
@@ -182,10 +185,11 @@ def wrap(module: ModuleType) -> None:
     if module.__name__ == URLS:
         module.READ_S = FAULTS.get("impatient", module.READ_S)  # type: ignore[attr-defined]
         return
+    if module.__name__ in GATHERING:
+        module.gather = before(module.gather, _gathering)  # type: ignore[attr-defined]
+        return
     function, stage = STAGES[module.__name__]
     setattr(module, function, before(getattr(module, function), lambda *_: at_stage(stage)))
-    if stage == "reconstruct":
-        module.gather = before(module.gather, _gathering)  # type: ignore[attr-defined]
 
 
 def _of_building(happen: Callable[[str], None], building: Any, *_: Any) -> None:
@@ -217,7 +221,7 @@ class Finder(importlib.abc.MetaPathFinder):
     """Finds the modules that are to be wrapped, once each."""
 
     def __init__(self) -> None:
-        self._open = {*STAGES, BUILDINGS, URLS}
+        self._open = {*STAGES, *GATHERING, BUILDINGS, URLS}
 
     def find_spec(
         self, name: str, path: Sequence[str] | None = None, target: ModuleType | None = None
