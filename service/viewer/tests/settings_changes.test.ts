@@ -1,6 +1,7 @@
 import { expect, test } from "vitest";
 import type { SettingSchema } from "../src/api/types";
-import { changes, flat, known, rangeWords, textOf, valueOf } from "../src/jobs/settings_changes";
+import { changes, flat, known, rangeWords } from "../src/jobs/settings_changes";
+import { textOf, valueOf } from "../src/page/form_fields";
 
 const SCHEMA: SettingSchema = {
   properties: {

@@ -1,6 +1,7 @@
 /** Settings of a job as a flat list of names and values, and back. */
 
 import type { SettingSchema } from "../api/types";
+import { textOf } from "../page/form_fields";
 
 /** Settings by name: `candidates.min_area_m2`, or `tile_size_m` for a general one. */
 export type Flat = Map<string, unknown>;
@@ -26,21 +27,6 @@ export function known(schema: SettingSchema): Map<string, SettingSchema> {
     else for (const [key, setting] of Object.entries(one.properties)) found.set(`${name}.${key}`, setting);
   }
   return found;
-}
-
-/** The value of a text; a text that does not fit stays a text, and the service says what is wrong with it. */
-export function valueOf(text: string, { type }: SettingSchema): unknown {
-  const trimmed = text.trim();
-  if (type === "boolean" && (trimmed === "true" || trimmed === "false")) return trimmed === "true";
-  if (type === "array") return trimmed.split(",").map((part) => number(part.trim()));
-  return type === "string" ? trimmed : number(trimmed);
-}
-
-/** A value as the text of a field. */
-export const textOf = (value: unknown): string => (Array.isArray(value) ? value.join(", ") : String(value ?? ""));
-
-function number(text: string): number | string {
-  return text !== "" && Number.isFinite(Number(text)) ? Number(text) : text;
 }
 
 /** What leads from one list to another, as nested tables: null takes a setting away. */
