@@ -44,15 +44,8 @@ export function changes(before: Flat, after: Flat): Record<string, unknown> {
 
 /** Unit, range and default of a setting in one sentence. */
 export function rangeWords({ default: usual, minimum, maximum, enum: words }: SettingSchema): string {
-  const range =
-    words !== undefined
-      ? words.join(", ")
-      : minimum !== undefined && maximum !== undefined
-        ? `${minimum} to ${maximum}`
-        : minimum !== undefined
-          ? `at least ${minimum}`
-          : maximum !== undefined
-            ? `at most ${maximum}`
-            : "";
-  return [range, usual === undefined || usual === "" ? "" : `usually ${textOf(usual)}`].filter((part) => part !== "").join("; ");
+  const least = minimum === undefined ? "" : `at least ${minimum}`;
+  const most = maximum === undefined ? "" : `at most ${maximum}`;
+  const parts = [words?.join(", ") ?? "", least, most, usual === undefined || usual === "" ? "" : `usually ${textOf(usual)}`];
+  return parts.filter((part) => part !== "").join("; ");
 }

@@ -1,7 +1,7 @@
 /** What the colour of a roof shows: the choices of the view, their classes and their colours. */
 
 import { Color } from "three";
-import { reasonWords } from "../words/reasons";
+import { reasonWords } from "../words/fields";
 import { CATEGORIES, type Category } from "../words/roof_types";
 import { SURFACE, type Batch, type Listed } from "./batching";
 import { countOf } from "./selection";

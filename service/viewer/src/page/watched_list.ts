@@ -26,8 +26,6 @@ export interface ListKind {
   member: string;
   /** Its address on the page. */
   words: readonly string[];
-  /** The members of an address that filter it, likewise at the service. */
-  filters: readonly string[];
   refreshMs: number;
 }
 
@@ -39,6 +37,8 @@ export abstract class WatchedList<T> extends Watching implements View {
   protected readonly frame = el("div");
   protected readonly pages = el("div");
   protected abstract readonly columns: readonly Column<T>[];
+  /** The members of an address that filter it, likewise at the service, with their controls; null for none. */
+  protected abstract readonly filters: Readonly<Record<string, HTMLInputElement | HTMLSelectElement | null>>;
   private shown = "";
 
   constructor(private readonly kind: ListKind) {
@@ -47,6 +47,10 @@ export abstract class WatchedList<T> extends Watching implements View {
 
   follow({ query }: Address): void {
     this.query = Object.fromEntries(query);
+    for (const [name, control] of Object.entries(this.filters)) {
+      // what is being typed is newer than the address
+      if (control !== null && (control.type !== "search" || document.activeElement !== control)) control.value = query.get(name) ?? "";
+    }
     this.refresh();
   }
 
@@ -54,6 +58,12 @@ export abstract class WatchedList<T> extends Watching implements View {
   refresh(): void {
     this.shown = "";
     void this.load();
+  }
+
+  /** The address of the list that the controls ask for, from its first page. */
+  protected asked(): string {
+    const given = Object.entries(this.filters).map(([name, control]) => [name, control?.value.trim() ?? this.query[name] ?? ""]);
+    return hashOf(this.kind.words, Object.fromEntries(given));
   }
 
   /** Words in place of a list without entries. */
@@ -73,9 +83,9 @@ export abstract class WatchedList<T> extends Watching implements View {
   }
 
   protected async read(signal: AbortSignal, isAsked: boolean): Promise<boolean> {
-    const { path, member, filters } = this.kind;
+    const { path, member } = this.kind;
     const offset = offsetOf(this.query["offset"]);
-    const given = filters.map((name) => [name, this.query[name] ?? ""]).filter(([, value]) => value !== "");
+    const given = Object.keys(this.filters).map((name) => [name, this.query[name] ?? ""]).filter(([, value]) => value !== "");
     const asked = new URLSearchParams([["limit", String(SIZE)], ["offset", String(offset)], ...given]);
     const answer = await getJson<Answer>(`${path}?${asked}`, { signal });
     if (signal.aborted) return false;

@@ -85,10 +85,10 @@ class ScheduleList extends WatchedList<Schedule> {
     { head: "Last time", kind: "only-wide", cell: ({ lastRun }) => (lastRun === undefined ? "–" : [outcomeChip(lastRun), ` ${ago(lastRun.at)}`]) },
     { head: "Actions", kind: "acts", cell: (one) => scheduleMenu(one, () => this.load(), () => void this.load()) },
   ];
+  protected readonly filters = {};
 
   constructor(place: HTMLElement) {
-    const words = ["schedules"];
-    super({ name: "Schedules", path: "schedules", member: "schedules", words, filters: [], refreshMs: REFRESH_MS });
+    super({ name: "Schedules", path: "schedules", member: "schedules", words: ["schedules"], refreshMs: REFRESH_MS });
     const make = el("a", { class: "button", href: "#/schedules/new" }, "New schedule…");
     const hint = el("p", { class: "hint" }, "Jobs that the service repeats by itself at fixed times.");
     place.replaceChildren(sheet("Schedules", [make], hint, this.note, this.frame, this.pages));
