@@ -9,8 +9,10 @@ import { titleOf } from "./job_words";
 import { changes, flat } from "./settings_changes";
 import { SettingsEditor } from "./settings_editor";
 
-/** Open the form that starts a job again, with changes. The inputs are those that the process describes. */
-export async function openRetry(job: StatusInfo): Promise<void> {
+/** Ask for changes of a job, then start a new one; the page goes to it. The inputs are those that the process describes. */
+export async function retry(listed: StatusInfo): Promise<void> {
+  // lists leave the request out
+  const job = listed.request === undefined ? await getJson<StatusInfo>(pathOfJob(listed.jobID)) : listed;
   const process = job.processID ?? "reconstruct";
   const { inputs } = await getJson<{ inputs: Record<string, InputDescription> }>(`processes/${encodeURIComponent(process)}`);
   const before = job.request?.inputs ?? {};

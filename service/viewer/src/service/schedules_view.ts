@@ -16,7 +16,7 @@ import { hasNext, SIZE, WatchedList, type Answer } from "../page/watched_list";
 import { WatchedPage } from "../page/watched_page";
 import { ago } from "../words/numbers";
 import { showNewSchedule, TimeFields } from "./schedule_form";
-import { clockWords, countWords, OUTCOME_WORDS, slotWords, tileLines } from "./schedules";
+import { clockWords, countWords, outcomeWords, slotWords, tileLines } from "./schedules";
 
 const REFRESH_MS = 10_000;
 
@@ -181,4 +181,4 @@ const nameOf = (one: Schedule): string => one.title ?? `Schedule ${one.scheduleI
 
 const nextWords = ({ nextTimes: [next], timeZone }: Schedule): string => (next === undefined ? "–" : clockWords(next, timeZone));
 
-const outcomeChip = ({ outcome }: ScheduleRun): HTMLElement => chip(outcome, OUTCOME_WORDS[outcome]);
+const outcomeChip = ({ outcome }: ScheduleRun): HTMLElement => chip(outcome, outcomeWords(outcome));
