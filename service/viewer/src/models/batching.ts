@@ -2,7 +2,7 @@ import { categoryOf, type Category } from "../words/roof_types";
 import { buildingMesh, type SceneFrame } from "./building_mesh";
 import type { Building, SurfaceKind } from "./cityjson";
 import { figuresOf, flagsOf, type Figures, type Flag } from "./figures";
-import { OutlinesInMaking, type Outlines } from "./outlines";
+import { outlineOf, type Outline } from "./outlines";
 
 /** The part of a record that the page lists, sorts and filters; a building's whole record is loaded when it is opened. */
 export interface Listed {
@@ -45,7 +45,7 @@ export const SURFACE = { wall: -1, ground: -2, roof: -3 } as const satisfies Rec
 /** Gathers buildings by category until they are taken as batches. */
 export class Batcher {
   private readonly open = new Map<Category, Gathered>();
-  private outlines = new OutlinesInMaking();
+  private readonly outlines: Outline[] = [];
 
   constructor(private readonly frame: SceneFrame) {}
 
@@ -59,7 +59,7 @@ export class Batcher {
       const gathered = this.open.get(category) ?? new Gathered(category);
       this.open.set(category, gathered);
       gathered.meshes.push({ id: building.id, reason, withinShare: figures.within ?? null, mesh });
-      this.outlines.add(building, category, this.frame);
+      this.outlines.push(outlineOf(building, category, this.frame));
     }
     return {
       id: building.id,
@@ -80,10 +80,8 @@ export class Batcher {
   }
 
   /** The outlines of what was added since the last call. */
-  takeOutlines(): Outlines {
-    const { outlines } = this;
-    this.outlines = new OutlinesInMaking();
-    return outlines.packed();
+  takeOutlines(): Outline[] {
+    return this.outlines.splice(0);
   }
 }
 
