@@ -3,7 +3,8 @@
 import { Color } from "three";
 import { reasonWords } from "../words/fields";
 import { CATEGORIES, type Category } from "../words/roof_types";
-import { SURFACE, type Batch, type Listed } from "./batching";
+import type { Batch, Listed } from "./batching";
+import { SURFACE } from "./building_mesh";
 import { countOf } from "./selection";
 
 /** A colour with its meaning. */
