@@ -20,10 +20,8 @@ export interface Listed {
 export interface Batch {
   category: Category;
   ids: string[];
-  /** Of each building; null for buildings that are `ok`. */
-  reasons: (string | null)[];
-  /** Share of the roof returns of each building within 0.2 m of its roof; null if unknown. */
-  withinShare: (number | null)[];
+  /** The buildings, as they are listed. */
+  listed: Listed[];
   /** Corner at which each building begins, and the number of corners after the last. */
   starts: Uint32Array;
   /** The same for the ends of the edges. */
@@ -51,22 +49,22 @@ export class Batcher {
     const { attributes } = building;
     const category = categoryOf(attributes["status"], attributes["roof_type"]);
     const mesh = buildingMesh(building, this.frame);
-    const [reason, figures] = [text(attributes["reason"]), figuresOf(attributes)];
+    const listed: Listed = {
+      id: building.id,
+      category,
+      reason: text(attributes["reason"]),
+      reasonDetail: text(attributes["reason_detail"]),
+      sourceId: text(attributes["source_id"]),
+      figures: figuresOf(attributes),
+      flags: flagsOf(attributes),
+    };
     if (mesh.positions.length > 0) {
       const gathered = this.open.get(category) ?? [];
       this.open.set(category, gathered);
-      gathered.push({ id: building.id, reason, withinShare: figures.within ?? null, mesh });
+      gathered.push({ listed, mesh });
       this.outlines.push(outlineOf(building, category, this.frame));
     }
-    return {
-      id: building.id,
-      category,
-      reason,
-      reasonDetail: text(attributes["reason_detail"]),
-      sourceId: text(attributes["source_id"]),
-      figures,
-      flags: flagsOf(attributes),
-    };
+    return listed;
   }
 
   /** The batches of what was added since the last call. */
@@ -83,9 +81,7 @@ export class Batcher {
 }
 
 interface Gathered {
-  id: string;
-  reason: string | null;
-  withinShare: number | null;
+  listed: Listed;
   mesh: BuildingMesh;
 }
 
@@ -100,9 +96,8 @@ function merged(category: Category, all: readonly Gathered[]): Batch {
   const corners = starts[n];
   const batch: Batch = {
     category,
-    ids: all.map(({ id }) => id),
-    reasons: all.map(({ reason }) => reason),
-    withinShare: all.map(({ withinShare }) => withinShare),
+    ids: all.map(({ listed }) => listed.id),
+    listed: all.map(({ listed }) => listed),
     starts,
     edgeStarts,
     boxes: new Float32Array(6 * n),
