@@ -42,12 +42,13 @@ class History extends WatchedList<StatusInfo> {
   private readonly words = el("input", { type: "search", id: "history-words", maxlength: 200, autocomplete: "off" });
   private readonly status = choice("history-status", { "": "any", ...STATUS_WORDS });
   private readonly process = choice("history-process", { "": "any", ...PROCESS_WORDS });
+  protected readonly empty = "No jobs yet. Drop a tile to make the first one.";
   protected readonly filters = { q: this.words, status: this.status, processID: this.process, scheduleID: null };
   private readonly tally = el("p", { class: "hint" });
   private readonly only = el("div");
 
   constructor(place: HTMLElement) {
-    super({ name: "Jobs", path: "jobs", member: "jobs", words: ["jobs"], refreshMs: 4000 });
+    super({ name: "Jobs", noun: "job", path: "jobs", member: "jobs", words: ["jobs"], refreshMs: 4000 });
     document.addEventListener(JOBS_CHANGED, this.changed);
     this.words.addEventListener("input", () => {
       clearTimeout(this.typing);
@@ -95,14 +96,6 @@ class History extends WatchedList<StatusInfo> {
     const schedule = el("a", { href: hashOf(["schedules", id]) }, `schedule ${id.slice(0, 8)}`);
     const all = el("a", { href: hashOf(["jobs"], { ...this.query, scheduleID: "", offset: "" }) }, "All jobs");
     return [el("p", {}, "Only jobs of ", schedule, ". ", all)];
-  }
-
-  protected empty(): string[] {
-    return ["No jobs yet. Drop a tile to make the first one."];
-  }
-
-  protected override filtered(): (Node | string)[] {
-    return ["No job fits. ", el("a", { href: "#/jobs" }, "Show all jobs")];
   }
 
   protected mayChange({ status }: StatusInfo): boolean {

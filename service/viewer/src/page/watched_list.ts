@@ -20,6 +20,8 @@ export interface Answer {
 export interface ListKind {
   /** For screen readers. */
   name: string;
+  /** What an entry is. */
+  noun: string;
   /** At the service. */
   path: string;
   /** The member of an answer that holds the entries. */
@@ -67,12 +69,7 @@ export abstract class WatchedList<T> extends Watching implements View {
   }
 
   /** Words in place of a list without entries. */
-  protected abstract empty(): (Node | string)[];
-
-  /** Words in place of a list of which a filter leaves none. */
-  protected filtered(): (Node | string)[] {
-    return this.empty();
-  }
+  protected abstract readonly empty: string;
 
   /** Whether an entry may change by itself. */
   protected abstract mayChange(entry: T): boolean;
@@ -102,10 +99,11 @@ export abstract class WatchedList<T> extends Watching implements View {
   }
 
   private draw(answer: Answer, entries: readonly T[], offset: number, isFiltered: boolean): void {
-    const { name, words } = this.kind;
+    const { name, noun, words } = this.kind;
     if (entries.length > 0) refill(this.frame, table(name, this.columns, entries));
     else if (offset > 0) refill(this.frame, nothing("There is nothing on this page. ", el("a", { href: hashOf(words, { ...this.query, offset: "" }) }, "First page")));
-    else refill(this.frame, nothing(...(isFiltered ? this.filtered() : this.empty())));
+    else if (isFiltered) refill(this.frame, nothing(`No ${noun} fits. `, el("a", { href: hashOf(words) }, `Show all ${noun}s`)));
+    else refill(this.frame, nothing(this.empty));
     const page = { offset, size: SIZE, shown: entries.length, total: answer.numberMatched ?? null, hasNext: hasNext(answer) };
     this.pages.replaceChildren(pager(page, words, this.query));
   }

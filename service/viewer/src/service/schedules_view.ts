@@ -85,17 +85,14 @@ class ScheduleList extends WatchedList<Schedule> {
     { head: "Last time", kind: "only-wide", cell: ({ lastRun }) => (lastRun === undefined ? "–" : [outcomeChip(lastRun), ` ${ago(lastRun.at)}`]) },
     { head: "Actions", kind: "acts", cell: (one) => scheduleMenu(one, () => this.load(), () => void this.load()) },
   ];
+  protected readonly empty = "No schedules yet. Make one from a job that went well: Actions, Repeat on a schedule.";
   protected readonly filters = {};
 
   constructor(place: HTMLElement) {
-    super({ name: "Schedules", path: "schedules", member: "schedules", words: ["schedules"], refreshMs: REFRESH_MS });
+    super({ name: "Schedules", noun: "schedule", path: "schedules", member: "schedules", words: ["schedules"], refreshMs: REFRESH_MS });
     const make = el("a", { class: "button", href: "#/schedules/new" }, "New schedule…");
     const hint = el("p", { class: "hint" }, "Jobs that the service repeats by itself at fixed times.");
     place.replaceChildren(sheet("Schedules", [make], hint, this.note, this.frame, this.pages));
-  }
-
-  protected empty(): string[] {
-    return ["No schedules yet. Make one from a job that went well: Actions, Repeat on a schedule."];
   }
 
   protected mayChange(): boolean {

@@ -223,10 +223,11 @@ class Log extends WatchedList<Delivery> {
   private readonly state = choice("log-state", { "": "any", ...DELIVERY_WORDS });
   private readonly receiver = choice("log-receiver", { "": "any" });
   private readonly job = el("input", { type: "text", id: "log-job", autocomplete: "off", spellcheck: "false" });
+  protected readonly empty = "No messages yet: no job has named a receiver, or nothing has happened since.";
   protected readonly filters = { job: this.job, state: this.state, webhook: this.receiver };
 
   constructor(private readonly nameOf: (webhook: string) => string | null) {
-    super({ name: "Messages", path: "webhooks/deliveries", member: "deliveries", words: ["webhooks"], refreshMs: REFRESH_MS });
+    super({ name: "Messages", noun: "message", path: "webhooks/deliveries", member: "deliveries", words: ["webhooks"], refreshMs: REFRESH_MS });
     const search = (): void => {
       location.hash = this.asked();
     };
@@ -240,14 +241,6 @@ class Log extends WatchedList<Delivery> {
     this.receiver.replaceChildren(...options.map(([value, label]) => el("option", { value }, label)));
     this.receiver.value = this.query["webhook"] ?? "";
     this.refresh();
-  }
-
-  protected empty(): string[] {
-    return ["No messages yet: no job has named a receiver, or nothing has happened since."];
-  }
-
-  protected override filtered(): (Node | string)[] {
-    return ["No message fits. ", el("a", { href: "#/webhooks" }, "Show all messages")];
   }
 
   protected mayChange({ state }: Delivery): boolean {
