@@ -8,25 +8,19 @@ export type Flat = Map<string, unknown>;
 
 /** The settings of nested tables. */
 export function flat(tables: Readonly<Record<string, unknown>>): Flat {
-  const found: Flat = new Map();
-  for (const [name, value] of Object.entries(tables)) {
-    if (typeof value === "object" && value !== null && !Array.isArray(value)) {
-      for (const [key, one] of Object.entries(value)) found.set(`${name}.${key}`, one);
-    } else {
-      found.set(name, value);
-    }
-  }
-  return found;
+  const isTable = (one: unknown): boolean => typeof one === "object" && one !== null && !Array.isArray(one);
+  return flattened(tables, (one) => (isTable(one) ? (one as Record<string, unknown>) : undefined));
 }
 
 /** All settings that a process knows, by the same names. */
-export function known(schema: SettingSchema): Map<string, SettingSchema> {
-  const found = new Map<string, SettingSchema>();
-  for (const [name, one] of Object.entries(schema.properties ?? {})) {
-    if (one.properties === undefined) found.set(name, one);
-    else for (const [key, setting] of Object.entries(one.properties)) found.set(`${name}.${key}`, setting);
-  }
-  return found;
+export const known = ({ properties = {} }: SettingSchema): Map<string, SettingSchema> => flattened(properties, (one) => one.properties);
+
+function flattened<T>(tables: Readonly<Record<string, T>>, tableOf: (one: T) => Record<string, T> | undefined): Map<string, T> {
+  const found = Object.entries(tables).flatMap(([name, one]): [string, T][] => {
+    const table = tableOf(one);
+    return table === undefined ? [[name, one]] : Object.entries(table).map(([key, inner]) => [`${name}.${key}`, inner]);
+  });
+  return new Map(found);
 }
 
 /** What leads from one list to another, as nested tables: null takes a setting away. */
