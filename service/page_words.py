@@ -37,7 +37,7 @@ def page_words() -> dict[str, Any]:
             for name, (label, digits) in columns.items()
         },
         "inputs": {one.input: one.meta["label"] for one in served(files=True) if one.type in (str, bool)}
-        | {"publish": "Publish as", "title": "Title"},
+        | {"publish": "Publish", "title": "Title"},
         "formats": {name: KINDS[outputs[0]].title for name, outputs in FORMATS.items()},
         "endings": {"tiles": ",".join(POINT_SUFFIXES), "vectors": ",".join(FOOTPRINT_SUFFIXES)},
     }

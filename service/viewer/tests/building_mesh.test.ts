@@ -1,5 +1,5 @@
 import { expect, test } from "vitest";
-import { buildingMesh } from "../src/models/building_mesh";
+import { buildingMesh, SURFACE } from "../src/models/building_mesh";
 import { SequenceReader, type Building } from "../src/models/cityjson";
 import { GABLE, METADATA } from "./gable";
 
@@ -22,9 +22,9 @@ function volume(positions: number[]): number {
 }
 
 test("the triangles close the solid, turned outwards", () => {
-  const { positions, kinds } = buildingMesh(gable(), FRAME);
+  const { positions, surfaces } = buildingMesh(gable(), FRAME);
   expect(volume(positions)).toBeCloseTo(10 * 6 * 3 + (10 * 6 * 2) / 2, 6);
-  expect(kinds.filter((kind) => kind === "roof")).toHaveLength(12);
+  expect(surfaces.filter((surface) => surface >= 0 || surface === SURFACE.roof)).toHaveLength(12);
 });
 
 test("units that are no metres are scaled, horizontal and vertical apart", () => {

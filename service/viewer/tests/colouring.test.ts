@@ -1,5 +1,6 @@
 import { expect, test } from "vitest";
-import { Batcher, SURFACE, type Batch } from "../src/models/batching";
+import { Batcher, type Batch } from "../src/models/batching";
+import { SURFACE } from "../src/models/building_mesh";
 import { SequenceReader, type Building } from "../src/models/cityjson";
 import { classesOf, coloursOf, CYCLE, outlineColour, type Colouring } from "../src/models/colouring";
 import { CATEGORIES } from "../src/words/roof_types";

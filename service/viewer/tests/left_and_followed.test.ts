@@ -60,7 +60,7 @@ const buildings = (...objects: Listed[]): FromLoading => ({
   kind: "buildings",
   listed: objects,
   batches: [],
-  outlines: { ids: [], categories: [], shapeStarts: new Uint32Array(1), ringStarts: new Uint32Array(1), xy: new Float32Array() },
+  outlines: [],
 });
 
 let service: FakeService;

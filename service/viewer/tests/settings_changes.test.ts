@@ -1,6 +1,7 @@
 import { expect, test } from "vitest";
 import type { SettingSchema } from "../src/api/types";
-import { changes, flat, known, rangeWords, textOf, valueOf } from "../src/jobs/settings_changes";
+import { changes, flat, known, rangeWords } from "../src/jobs/settings_changes";
+import { textOf, valueOf } from "../src/page/form_fields";
 
 const SCHEMA: SettingSchema = {
   properties: {
@@ -36,7 +37,7 @@ test("texts become values of the setting's type, and stay texts where they do no
 });
 
 test("the range of a setting is shown with its usual value", () => {
-  expect(rangeWords({ minimum: 0.5, maximum: 100, default: 4 })).toBe("0.5 to 100; usually 4");
+  expect(rangeWords({ minimum: 0.5, maximum: 100, default: 4 })).toBe("at least 0.5; at most 100; usually 4");
   expect(rangeWords({ enum: ["trust", "audit"], default: "trust" })).toBe("trust, audit; usually trust");
   expect(rangeWords({ minimum: 1 })).toBe("at least 1");
   expect(rangeWords({})).toBe("");

@@ -239,7 +239,7 @@ def test_levels_of_detail_are_chosen_for_the_job_and_in_the_view(
     expect(button).to_have_attribute("aria-disabled", "true")
     other = page.get_by_role("checkbox", name="kmeans", exact=True)
     other.check()
-    expect(boxes.first).to_be_disabled()
+    expect(boxes.first).to_be_hidden()
     expect(button).to_have_text("Compare 2 methods")
     other.uncheck()
     for box in reversed(boxes.all()[:3]):

@@ -1,4 +1,4 @@
-"""Large files: tus-js-client against the service, and the page that loses its network or is loaded again meanwhile."""
+"""Uploads: tus-js-client against the service, and the page that loses its network or is loaded again meanwhile."""
 
 import hashlib
 import json
@@ -25,7 +25,7 @@ SOME_BYTES = 3_000_000
 
 @pytest.fixture(scope="module")
 def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A tile that is not small for the page."""
+    """A tile whose upload takes its time."""
     path = tmp_path_factory.mktemp("large") / "large.las"
     path.write_bytes(las_bytes(400_000, compressed=False))
     return path
@@ -189,9 +189,3 @@ def test_a_file_that_is_removed_while_it_is_sent_leaves_nothing(visit: Open, gat
         gate.allow(float("inf"))
     assert removed.value.status in {204, 423}
     opened.page.wait_for_function("localStorage.length === 0")
-
-
-def test_a_small_file_does_not_load_the_library(visit: Open, service: str, house: Path) -> None:
-    opened = visit(service)
-    opened.drop(house)
-    assert not [url for url in opened.urls if "resumable" in url]

@@ -1,7 +1,7 @@
 /** The service's REST interface, as far as the page uses it. */
 
 import { counted } from "../words/numbers";
-import type { Preflight, RunReport, Status, UploadInfo } from "./types";
+import type { RunReport, Status } from "./types";
 
 const KEY = "gablework.key";
 
@@ -177,34 +177,4 @@ function remedyOf(status: number, retryAfter: string | null): string {
   const seconds = Number(retryAfter);
   if (status === 429 && seconds > 0) return `Try again in ${counted(Math.ceil(seconds), "second")}.`;
   return BY_STATUS[status] ?? (status >= 500 ? "This is a fault of the service: its operator finds more in its log." : "");
-}
-
-/**
- * Sends a file as it is; `onProgress` gets the share that has left this machine, 0 to 1.
- *
- * @throws Problem when it is refused, AbortError when it is cancelled.
- */
-export function upload(file: File, onProgress: (share: number) => void, signal: AbortSignal): Promise<UploadInfo> {
-  // fetch reports no progress of uploads
-  return new Promise((resolve, reject) => {
-    const sending = new XMLHttpRequest();
-    sending.open("POST", serviceUrl(`uploads?filename=${encodeURIComponent(file.name)}`));
-    for (const [name, value] of Object.entries(authorization())) sending.setRequestHeader(name, value);
-    sending.setRequestHeader("Content-Type", "application/octet-stream");
-    sending.setRequestHeader("Accept", "application/json");
-    sending.upload.onprogress = (event) => onProgress(event.total > 0 ? event.loaded / event.total : 0);
-    sending.onload = () => {
-      if (sending.status < 200 || sending.status > 299) {
-        const retryAfter = sending.getResponseHeader("Retry-After");
-        reject(problemOf(sending.status, sending.statusText, sending.responseText, retryAfter));
-        return;
-      }
-      const { uploadID, preflight } = JSON.parse(sending.responseText) as { uploadID: string; preflight: Preflight };
-      resolve({ href: serviceUrl(`uploads/${uploadID}`), preflight });
-    };
-    sending.onerror = () => reject(unreachable());
-    sending.onabort = () => reject(new DOMException("cancelled", "AbortError"));
-    signal.addEventListener("abort", () => sending.abort());
-    sending.send(file);
-  });
 }

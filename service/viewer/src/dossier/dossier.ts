@@ -138,7 +138,9 @@ function draw(body: HTMLElement, loaded: Loaded): () => void {
   const key = el("ul", { class: "dossier-key" });
   let scene: DossierScene | null = null;
   let over = false;
-  const paint = (colouring: Colouring): void => {
+  let colouring: Colouring = "residual";
+  const paint = (chosen: Colouring): void => {
+    colouring = chosen;
     plan.replaceChildren(planDrawing(outline, edges, section, points, colouring));
     if (section !== null) profile.replaceChildren(sectionDrawing(model, section, points, halfWidthM, colouring));
     key.replaceChildren(...(points === null ? [] : colourKey(points, colouring)));
@@ -171,12 +173,11 @@ function draw(body: HTMLElement, loaded: Loaded): () => void {
     figuresTable(properties, decisions ?? []),
     formsTable(properties, decisions),
   );
-  const first: Colouring = "residual";
-  paint(first);
+  paint(colouring);
   if (space !== null) {
     import("./dossier_scene")
       .then((loaded3d) => {
-        if (!over) scene = new loaded3d.DossierScene(canvas, loaded.batches, points, colouringOf(body));
+        if (!over) scene = new loaded3d.DossierScene(canvas, loaded.batches, points, colouring);
       })
       .catch(() => stage.replaceWith(el("p", { class: "hint" }, "This browser cannot draw in 3D, or the view could not be loaded.")));
   }
@@ -184,10 +185,6 @@ function draw(body: HTMLElement, loaded: Loaded): () => void {
     over = true;
     scene?.dispose();
   };
-}
-
-function colouringOf(body: HTMLElement): Colouring {
-  return body.querySelector<HTMLInputElement>("input[name=dossier-colour]:checked")?.value === "plane" ? "plane" : "residual";
 }
 
 function colourChoice(onChoice: (colouring: Colouring) => void): HTMLElement {

@@ -25,14 +25,6 @@ class Cloud implements Layer {
     this.object.geometry.setAttribute("color", new BufferAttribute(colours, 3));
   }
 
-  update(): void {
-    // it changes only by `colour`
-  }
-
-  pick(): null {
-    return null;
-  }
-
   dispose(): void {
     this.object.geometry.dispose();
     this.object.material.dispose();

@@ -1,9 +1,8 @@
 /** The sentences of a dossier: what of a model deserves trust, which figures decided, which forms were tried. */
 
 import type { Decision, Feature } from "../api/types";
-import { capital } from "../words/fields";
+import { capital, reasonWords } from "../words/fields";
 import { counted, measure } from "../words/numbers";
-import { reasonWords } from "../words/reasons";
 
 type Properties = Feature["properties"];
 

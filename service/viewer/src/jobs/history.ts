@@ -42,12 +42,13 @@ class History extends WatchedList<StatusInfo> {
   private readonly words = el("input", { type: "search", id: "history-words", maxlength: 200, autocomplete: "off" });
   private readonly status = choice("history-status", { "": "any", ...STATUS_WORDS });
   private readonly process = choice("history-process", { "": "any", ...PROCESS_WORDS });
+  protected readonly empty = "No jobs yet. Drop a tile to make the first one.";
+  protected readonly filters = { q: this.words, status: this.status, processID: this.process, scheduleID: null };
   private readonly tally = el("p", { class: "hint" });
   private readonly only = el("div");
 
   constructor(place: HTMLElement) {
-    const filters = ["q", "status", "processID", "scheduleID"];
-    super({ name: "Jobs", path: "jobs", member: "jobs", words: ["jobs"], filters, refreshMs: 4000 });
+    super({ name: "Jobs", noun: "job", path: "jobs", member: "jobs", words: ["jobs"], refreshMs: 4000 });
     document.addEventListener(JOBS_CHANGED, this.changed);
     this.words.addEventListener("input", () => {
       clearTimeout(this.typing);
@@ -64,11 +65,6 @@ class History extends WatchedList<StatusInfo> {
   }
 
   override follow(address: Address): void {
-    const { query } = address;
-    // what is being typed is newer than the address
-    if (document.activeElement !== this.words) this.words.value = query.get("q") ?? "";
-    this.status.value = query.get("status") ?? "";
-    this.process.value = query.get("processID") ?? "";
     super.follow(address);
     this.only.replaceChildren(...this.ofSchedule());
   }
@@ -82,8 +78,7 @@ class History extends WatchedList<StatusInfo> {
   /** Show what the form asks for, from the first page. */
   private search(): void {
     clearTimeout(this.typing);
-    const query = { q: this.words.value.trim(), status: this.status.value, processID: this.process.value };
-    const hash = hashOf(["jobs"], { ...query, scheduleID: this.query["scheduleID"] ?? "" });
+    const hash = this.asked();
     if (hash === location.hash) return;
     history.replaceState(null, "", hash); // a search in many letters is one step back
     this.follow(partsOf(hash));
@@ -101,14 +96,6 @@ class History extends WatchedList<StatusInfo> {
     const schedule = el("a", { href: hashOf(["schedules", id]) }, `schedule ${id.slice(0, 8)}`);
     const all = el("a", { href: hashOf(["jobs"], { ...this.query, scheduleID: "", offset: "" }) }, "All jobs");
     return [el("p", {}, "Only jobs of ", schedule, ". ", all)];
-  }
-
-  protected empty(): string[] {
-    return ["No jobs yet. Drop a tile to make the first one."];
-  }
-
-  protected override filtered(): (Node | string)[] {
-    return ["No job fits. ", el("a", { href: "#/jobs" }, "Show all jobs")];
   }
 
   protected mayChange({ status }: StatusInfo): boolean {

@@ -1,6 +1,6 @@
 /** What can be done with a job: try it again, keep it, repeat it, cancel it, remove it. */
 
-import { getJson, isOver, pathOfJob, request, sendJson, unreachable } from "../api/requests";
+import { getJson, isOver, pathOfJob, request, sendJson } from "../api/requests";
 import type { Status, StatusInfo } from "../api/types";
 import { actionMenu, type Item } from "../page/action_menu";
 import { hashOf } from "../page/address";
@@ -8,6 +8,7 @@ import { ask } from "../page/dialogs";
 import { announce } from "../page/notices";
 import { jobsChanged } from "../page/view";
 import { hasModels, titleOf } from "./job_words";
+import { retry } from "./retry_form";
 
 /** A menu of all of it. */
 export function jobMenu(job: StatusInfo): HTMLElement {
@@ -37,16 +38,6 @@ function comparing(job: StatusInfo): Item[] {
   const [oldMethod = "", newMethod = ""] = Object.keys(job.summary?.runs ?? {});
   if (newMethod === "") return [{ label: "Compare with another…", href: hashOf(["changes"], { old: job.jobID }) }];
   return [{ label: "Two methods in 3D", href: hashOf(["changes"], { old: job.jobID, oldMethod, new: job.jobID, newMethod }) }];
-}
-
-/** Ask for changes, then start a new job; the page goes to it. */
-export async function retry(job: StatusInfo): Promise<void> {
-  const { openRetry } = await import("./retry_form").catch(() => {
-    throw unreachable();
-  });
-  // lists leave the request out
-  const whole = job.request === undefined ? await getJson<StatusInfo>(pathOfJob(job.jobID)) : job;
-  await openRetry(whole);
 }
 
 /** Keep a job whatever its age and size, or no longer; returns it as it is now. */

@@ -1,46 +1,26 @@
 /** Settings of a job as a flat list of names and values, and back. */
 
 import type { SettingSchema } from "../api/types";
+import { textOf } from "../page/form_fields";
 
 /** Settings by name: `candidates.min_area_m2`, or `tile_size_m` for a general one. */
 export type Flat = Map<string, unknown>;
 
 /** The settings of nested tables. */
 export function flat(tables: Readonly<Record<string, unknown>>): Flat {
-  const found: Flat = new Map();
-  for (const [name, value] of Object.entries(tables)) {
-    if (typeof value === "object" && value !== null && !Array.isArray(value)) {
-      for (const [key, one] of Object.entries(value)) found.set(`${name}.${key}`, one);
-    } else {
-      found.set(name, value);
-    }
-  }
-  return found;
+  const isTable = (one: unknown): boolean => typeof one === "object" && one !== null && !Array.isArray(one);
+  return flattened(tables, (one) => (isTable(one) ? (one as Record<string, unknown>) : undefined));
 }
 
 /** All settings that a process knows, by the same names. */
-export function known(schema: SettingSchema): Map<string, SettingSchema> {
-  const found = new Map<string, SettingSchema>();
-  for (const [name, one] of Object.entries(schema.properties ?? {})) {
-    if (one.properties === undefined) found.set(name, one);
-    else for (const [key, setting] of Object.entries(one.properties)) found.set(`${name}.${key}`, setting);
-  }
-  return found;
-}
+export const known = ({ properties = {} }: SettingSchema): Map<string, SettingSchema> => flattened(properties, (one) => one.properties);
 
-/** The value of a text; a text that does not fit stays a text, and the service says what is wrong with it. */
-export function valueOf(text: string, { type }: SettingSchema): unknown {
-  const trimmed = text.trim();
-  if (type === "boolean" && (trimmed === "true" || trimmed === "false")) return trimmed === "true";
-  if (type === "array") return trimmed.split(",").map((part) => number(part.trim()));
-  return type === "string" ? trimmed : number(trimmed);
-}
-
-/** A value as the text of a field. */
-export const textOf = (value: unknown): string => (Array.isArray(value) ? value.join(", ") : String(value ?? ""));
-
-function number(text: string): number | string {
-  return text !== "" && Number.isFinite(Number(text)) ? Number(text) : text;
+function flattened<T>(tables: Readonly<Record<string, T>>, tableOf: (one: T) => Record<string, T> | undefined): Map<string, T> {
+  const found = Object.entries(tables).flatMap(([name, one]): [string, T][] => {
+    const table = tableOf(one);
+    return table === undefined ? [[name, one]] : Object.entries(table).map(([key, inner]) => [`${name}.${key}`, inner]);
+  });
+  return new Map(found);
 }
 
 /** What leads from one list to another, as nested tables: null takes a setting away. */
@@ -58,15 +38,8 @@ export function changes(before: Flat, after: Flat): Record<string, unknown> {
 
 /** Unit, range and default of a setting in one sentence. */
 export function rangeWords({ default: usual, minimum, maximum, enum: words }: SettingSchema): string {
-  const range =
-    words !== undefined
-      ? words.join(", ")
-      : minimum !== undefined && maximum !== undefined
-        ? `${minimum} to ${maximum}`
-        : minimum !== undefined
-          ? `at least ${minimum}`
-          : maximum !== undefined
-            ? `at most ${maximum}`
-            : "";
-  return [range, usual === undefined || usual === "" ? "" : `usually ${textOf(usual)}`].filter((part) => part !== "").join("; ");
+  const least = minimum === undefined ? "" : `at least ${minimum}`;
+  const most = maximum === undefined ? "" : `at most ${maximum}`;
+  const parts = [words?.join(", ") ?? "", least, most, usual === undefined || usual === "" ? "" : `usually ${textOf(usual)}`];
+  return parts.filter((part) => part !== "").join("; ");
 }

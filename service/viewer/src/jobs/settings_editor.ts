@@ -1,8 +1,8 @@
 import type { SettingSchema } from "../api/types";
 import { button, el } from "../page/elements";
-import { controlOf } from "../page/form_fields";
+import { controlOf, textOf, valueOf } from "../page/form_fields";
 import { announce } from "../page/notices";
-import { known, rangeWords, textOf, valueOf, type Flat } from "./settings_changes";
+import { known, rangeWords, type Flat } from "./settings_changes";
 import "./settings_editor.css";
 
 /** The settings that differ from the usual ones: one row each, and a field that adds any of the others. */

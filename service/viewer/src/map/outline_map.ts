@@ -1,7 +1,7 @@
 /** The outlines in plan, north up, drawn on a canvas. It is independent of the service, of lists and of the 3D view. */
 
 import { MathUtils } from "three";
-import type { Outlines } from "../models/outlines";
+import type { Outline } from "../models/outlines";
 import { boxAround, united, type Box } from "../models/plan";
 import { el, onKeys } from "../page/elements";
 import { CATEGORIES, CATEGORY_NAMES, isFlat, type Category } from "../words/roof_types";
@@ -21,10 +21,7 @@ export interface Backdrop {
   draw(context: CanvasRenderingContext2D, view: MapView): void;
 }
 
-interface Shape {
-  id: string;
-  category: Category;
-  rings: Float32Array[];
+interface Shape extends Outline {
   box: Box;
 }
 
@@ -92,14 +89,8 @@ export class OutlineMap {
   }
 
   /** Add outlines; until the user moves the map it keeps showing all of them. */
-  add({ ids, categories, shapeStarts, ringStarts, xy }: Outlines): void {
-    ids.forEach((id, i) => {
-      const rings: Float32Array[] = [];
-      for (let ring = shapeStarts[i]; ring < shapeStarts[i + 1]; ring++) {
-        rings.push(xy.subarray(2 * ringStarts[ring], 2 * ringStarts[ring + 1]));
-      }
-      if (rings.length > 0) this.shapes.set(id, { id, category: categories[i], rings, box: boxOf(rings) });
-    });
+  add(outlines: readonly Outline[]): void {
+    for (const one of outlines) if (one.rings.length > 0) this.shapes.set(one.id, { ...one, box: boxOf(one.rings) });
     this.cells = null;
     if (!this.touched) this.fit(false);
     this.request();

@@ -1,8 +1,8 @@
 import { categoryOf, type Category } from "../words/roof_types";
-import { buildingMesh, type SceneFrame } from "./building_mesh";
-import type { Building, SurfaceKind } from "./cityjson";
+import { buildingMesh, type BuildingMesh, type SceneFrame } from "./building_mesh";
+import type { Building } from "./cityjson";
 import { figuresOf, flagsOf, type Figures, type Flag } from "./figures";
-import { OutlinesInMaking, type Outlines } from "./outlines";
+import { outlineOf, type Outline } from "./outlines";
 
 /** The part of a record that the page lists, sorts and filters; a building's whole record is loaded when it is opened. */
 export interface Listed {
@@ -20,10 +20,8 @@ export interface Listed {
 export interface Batch {
   category: Category;
   ids: string[];
-  /** Of each building; null for buildings that are `ok`. */
-  reasons: (string | null)[];
-  /** Share of the roof returns of each building within 0.2 m of its roof; null if unknown. */
-  withinShare: (number | null)[];
+  /** The buildings, as they are listed. */
+  listed: Listed[];
   /** Corner at which each building begins, and the number of corners after the last. */
   starts: Uint32Array;
   /** The same for the ends of the edges. */
@@ -39,13 +37,10 @@ export interface Batch {
   edges: Float32Array;
 }
 
-/** Surfaces that are not a numbered roof plane. */
-export const SURFACE = { wall: -1, ground: -2, roof: -3 } as const satisfies Record<SurfaceKind, number>;
-
 /** Gathers buildings by category until they are taken as batches. */
 export class Batcher {
-  private readonly open = new Map<Category, Gathered>();
-  private outlines = new OutlinesInMaking();
+  private readonly open = new Map<Category, Gathered[]>();
+  private readonly outlines: Outline[] = [];
 
   constructor(private readonly frame: SceneFrame) {}
 
@@ -54,80 +49,71 @@ export class Batcher {
     const { attributes } = building;
     const category = categoryOf(attributes["status"], attributes["roof_type"]);
     const mesh = buildingMesh(building, this.frame);
-    const [reason, figures] = [text(attributes["reason"]), figuresOf(attributes)];
-    if (mesh.positions.length > 0) {
-      const gathered = this.open.get(category) ?? new Gathered(category);
-      this.open.set(category, gathered);
-      gathered.meshes.push({ id: building.id, reason, withinShare: figures.within ?? null, mesh });
-      this.outlines.add(building, category, this.frame);
-    }
-    return {
+    const listed: Listed = {
       id: building.id,
       category,
-      reason,
+      reason: text(attributes["reason"]),
       reasonDetail: text(attributes["reason_detail"]),
       sourceId: text(attributes["source_id"]),
-      figures,
+      figures: figuresOf(attributes),
       flags: flagsOf(attributes),
     };
+    if (mesh.positions.length > 0) {
+      const gathered = this.open.get(category) ?? [];
+      this.open.set(category, gathered);
+      gathered.push({ listed, mesh });
+      this.outlines.push(outlineOf(building, category, this.frame));
+    }
+    return listed;
   }
 
   /** The batches of what was added since the last call. */
   take(): Batch[] {
-    const batches = [...this.open.values()].map((gathered) => gathered.merged());
+    const batches = [...this.open].map(([category, gathered]) => merged(category, gathered));
     this.open.clear();
     return batches;
   }
 
   /** The outlines of what was added since the last call. */
-  takeOutlines(): Outlines {
-    const { outlines } = this;
-    this.outlines = new OutlinesInMaking();
-    return outlines.packed();
+  takeOutlines(): Outline[] {
+    return this.outlines.splice(0);
   }
 }
 
-class Gathered {
-  readonly meshes: { id: string; reason: string | null; withinShare: number | null; mesh: ReturnType<typeof buildingMesh> }[] = [];
+interface Gathered {
+  listed: Listed;
+  mesh: BuildingMesh;
+}
 
-  constructor(private readonly category: Category) {}
-
-  merged(): Batch {
-    const n = this.meshes.length;
-    const starts = new Uint32Array(n + 1);
-    const edgeStarts = new Uint32Array(n + 1);
-    this.meshes.forEach(({ mesh }, i) => {
-      starts[i + 1] = starts[i] + mesh.positions.length / 3;
-      edgeStarts[i + 1] = edgeStarts[i] + mesh.edges.length / 3;
-    });
-    const corners = starts[n];
-    const batch: Batch = {
-      category: this.category,
-      ids: this.meshes.map(({ id }) => id),
-      reasons: this.meshes.map(({ reason }) => reason),
-      withinShare: this.meshes.map(({ withinShare }) => withinShare),
-      starts,
-      edgeStarts,
-      boxes: new Float32Array(6 * n),
-      positions: new Float32Array(3 * corners),
-      normals: new Int8Array(4 * corners), // four bytes per corner: graphics cards need that alignment
-      surfaces: new Int16Array(corners),
-      edges: new Float32Array(3 * edgeStarts[n]),
-    };
-    this.meshes.forEach(({ mesh }, i) => {
-      const { kinds, planes, normals } = mesh;
-      batch.positions.set(mesh.positions, 3 * starts[i]);
-      batch.edges.set(mesh.edges, 3 * edgeStarts[i]);
-      batch.boxes.set(boxOf(mesh.positions), 6 * i);
-      for (let corner = 0; corner < kinds.length; corner++) {
-        const at = starts[i] + corner;
-        for (let part = 0; part < 3; part++) batch.normals[4 * at + part] = normals[3 * corner + part];
-        const numbered = kinds[corner] === "roof" && planes[corner] >= 0;
-        batch.surfaces[at] = numbered ? planes[corner] : SURFACE[kinds[corner]];
-      }
-    });
-    return batch;
-  }
+function merged(category: Category, all: readonly Gathered[]): Batch {
+  const n = all.length;
+  const starts = new Uint32Array(n + 1);
+  const edgeStarts = new Uint32Array(n + 1);
+  all.forEach(({ mesh }, i) => {
+    starts[i + 1] = starts[i] + mesh.positions.length / 3;
+    edgeStarts[i + 1] = edgeStarts[i] + mesh.edges.length / 3;
+  });
+  const corners = starts[n];
+  const batch: Batch = {
+    category,
+    ids: all.map(({ listed }) => listed.id),
+    listed: all.map(({ listed }) => listed),
+    starts,
+    edgeStarts,
+    boxes: new Float32Array(6 * n),
+    positions: new Float32Array(3 * corners),
+    normals: new Int8Array(4 * corners),
+    surfaces: new Int16Array(corners),
+    edges: new Float32Array(3 * edgeStarts[n]),
+  };
+  all.forEach(({ mesh }, i) => {
+    batch.positions.set(mesh.positions, 3 * starts[i]);
+    batch.edges.set(mesh.edges, 3 * edgeStarts[i]);
+    batch.boxes.set(boxOf(mesh.positions), 6 * i);
+    batch.normals.set(mesh.normals, 4 * starts[i]);
+    batch.surfaces.set(mesh.surfaces, starts[i]);
+  });
+  return batch;
 }
 
 function boxOf(positions: readonly number[]): number[] {

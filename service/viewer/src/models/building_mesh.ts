@@ -5,15 +5,16 @@ import { ringNormal, triangulate, type Normal } from "./triangulation";
 export interface BuildingMesh {
   /** x, y, z of the triangles' corners. */
   positions: number[];
-  /** Normals of the corners, -127 to 127. */
+  /** Normals of the corners, -127 to 127, and a zero each: graphics cards need four bytes. */
   normals: number[];
-  /** The kind of surface that each corner belongs to. */
-  kinds: SurfaceKind[];
-  /** Its roof plane, -1 for none. */
-  planes: number[];
+  /** The surface of each corner: its roof plane, or one of `SURFACE`. */
+  surfaces: number[];
   /** x, y, z of both ends of the visible edges. */
   edges: number[];
 }
+
+/** Surfaces that are not a numbered roof plane. */
+export const SURFACE = { wall: -1, ground: -2, roof: -3 } as const satisfies Record<SurfaceKind, number>;
 
 /** From CRS coordinates to the scene: metres, around an origin that keeps them small. */
 export interface SceneFrame {
@@ -34,19 +35,17 @@ const SMOOTH = Math.cos((2 * Math.PI) / 180);
 /** The triangles and the edges of a building; a building without faces gives none. */
 export function buildingMesh(building: Building, frame: SceneFrame): BuildingMesh {
   const vertices = inScene(building.vertices, frame);
-  const mesh: BuildingMesh = { positions: [], normals: [], kinds: [], planes: [], edges: [] };
+  const mesh: BuildingMesh = { positions: [], normals: [], surfaces: [], edges: [] };
   const edges = new Map<number, { normal: Normal; seen: boolean }>();
   const count = vertices.length / 3;
   for (const { kind, rings, plane = -1 } of building.faces) {
     const normal = ringNormal(vertices, rings[0] ?? []);
-    const nx = Math.round(127 * normal[0]);
-    const ny = Math.round(127 * normal[1]);
-    const nz = Math.round(127 * normal[2]);
+    const [nx, ny, nz] = normal.map((part) => Math.round(127 * part));
+    const surface = kind === "roof" && plane >= 0 ? plane : SURFACE[kind];
     for (const corner of triangulate(vertices, rings, normal)) {
       mesh.positions.push(vertices[3 * corner], vertices[3 * corner + 1], vertices[3 * corner + 2]);
-      mesh.normals.push(nx, ny, nz);
-      mesh.kinds.push(kind);
-      mesh.planes.push(plane);
+      mesh.normals.push(nx, ny, nz, 0);
+      mesh.surfaces.push(surface);
     }
     for (const ring of rings) {
       for (let i = 0; i < ring.length; i++) {

@@ -34,8 +34,6 @@ export interface Building {
 
 export interface Metadata {
   transform: Transform;
-  /** EPSG code without the authority; null if the CRS is unknown. */
-  epsg: string | null;
   /** x_min, y_min, z_min, x_max, y_max, z_max; null if nothing was modelled. */
   extent: number[] | null;
 }
@@ -92,16 +90,14 @@ interface RawLine {
   type?: string;
   id?: string;
   transform?: Transform;
-  metadata?: { referenceSystem?: string; geographicalExtent?: number[] };
+  metadata?: { geographicalExtent?: number[] };
   CityObjects?: Record<string, { type: string; attributes?: Record<string, unknown>; geometry?: RawGeometry[] }>;
   vertices?: Xyz[];
 }
 
 function metadataOf(line: RawLine): Metadata {
-  const code = /\/EPSG\/[^/]+\/(\d+)$/.exec(line.metadata?.referenceSystem ?? "");
   return {
     transform: line.transform ?? { scale: [1, 1, 1], translate: [0, 0, 0] },
-    epsg: code?.[1] ?? null,
     extent: line.metadata?.geographicalExtent ?? null,
   };
 }

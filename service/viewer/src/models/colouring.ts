@@ -1,9 +1,10 @@
 /** What the colour of a roof shows: the choices of the view, their classes and their colours. */
 
 import { Color } from "three";
-import { reasonWords } from "../words/reasons";
-import { CATEGORIES, type Category } from "../words/roof_types";
-import { SURFACE, type Batch, type Listed } from "./batching";
+import { reasonWords } from "../words/fields";
+import { CATEGORIES } from "../words/roof_types";
+import type { Batch, Listed } from "./batching";
+import { SURFACE } from "./building_mesh";
 import { countOf } from "./selection";
 
 /** A colour with its meaning. */
@@ -70,22 +71,17 @@ export type Counted = ColourClass & { count: number };
 
 /** The classes that the buildings have, with the number of each. */
 export function classesOf(colouring: "residual" | "status" | "reason", buildings: readonly Listed[]): Counted[] {
-  const counts = countOf(buildings.map(({ category, reason, figures }) => classOf(colouring, category, reason, figures.within ?? null)));
+  const counts = countOf(buildings.map((one) => classOf(colouring, one)));
   const order: readonly ColourClass[] =
     colouring === "residual" ? RESIDUALS : colouring === "status" ? STATUSES : [NO_REASON, ...REASONS.values(), OTHER_REASON];
   return [...order, LEFT_OUT].flatMap((one) => (counts.has(one) ? [{ ...one, count: counts.get(one) ?? 0 }] : []));
 }
 
-function classOf(
-  colouring: "residual" | "status" | "reason",
-  category: Category,
-  reason: string | null,
-  withinShare: number | null,
-): ColourClass {
+function classOf(colouring: "residual" | "status" | "reason", { category, reason, figures: { within } }: Listed): ColourClass {
   if (category === "rejected") return LEFT_OUT;
   switch (colouring) {
     case "residual":
-      return RESIDUALS.find(({ fromShare }) => withinShare !== null && withinShare >= fromShare) ?? RESIDUALS[RESIDUALS.length - 1];
+      return RESIDUALS.find(({ fromShare }) => within !== undefined && within >= fromShare) ?? RESIDUALS[RESIDUALS.length - 1];
     case "status":
       return STATUSES[["doubtful", "fallback", "failed"].indexOf(category) + 1];
     case "reason":
@@ -96,25 +92,25 @@ function classOf(
 /** What the colours of roofs show: one of the choices, or a colour for each id; null is that of the type. */
 export type RoofColours = Colouring | ((id: string) => string | null);
 
-function colourOf(colouring: Colouring, category: Category, reason: string | null, withinShare: number | null): string {
-  if (colouring === "type") return CATEGORIES[category].colour;
+function colourOf(colouring: Colouring, object: Listed): string {
+  if (colouring === "type") return CATEGORIES[object.category].colour;
   if (colouring === "plain") return PLAIN;
-  return colouring === "plane" ? GREY : classOf(colouring, category, reason, withinShare).colour;
+  return colouring === "plane" ? GREY : classOf(colouring, object).colour;
 }
 
 /** The colour of an object's outline on the map; outlines have no planes, and none but grey are seen without colours. */
-export function outlineColour(colouring: Colouring, { category, reason, figures }: Listed): string {
-  return colouring === "plain" ? GREY : colourOf(colouring, category, reason, figures.within ?? null);
+export function outlineColour(colouring: Colouring, object: Listed): string {
+  return colouring === "plain" ? GREY : colourOf(colouring, object);
 }
 
 /** Red, green, blue, opaque for each corner of a batch; in the linear space that three works in. */
 export function coloursOf(batch: Batch, shown: RoofColours): Uint8Array {
-  const { ids, category, reasons, withinShare, starts, surfaces } = batch;
+  const { listed, starts, surfaces } = batch;
   const colours = new Uint8Array(4 * surfaces.length).fill(255);
   const cycle = CYCLE.map(linear);
-  ids.forEach((id, n) => {
-    const given = typeof shown === "function" ? shown(id) : null;
-    const roof = linear(given ?? colourOf(typeof shown === "function" ? "type" : shown, category, reasons[n], withinShare[n]));
+  listed.forEach((object, n) => {
+    const given = typeof shown === "function" ? shown(object.id) : null;
+    const roof = linear(given ?? colourOf(typeof shown === "function" ? "type" : shown, object));
     for (let corner = starts[n]; corner < starts[n + 1]; corner++) {
       const surface = surfaces[corner];
       let colour = roof;

@@ -2,7 +2,7 @@ import type { Feature } from "../api/types";
 import { Batcher, type Batch } from "./batching";
 import type { SceneFrame } from "./building_mesh";
 import type { Face } from "./cityjson";
-import type { Outlines } from "./outlines";
+import type { Outline } from "./outlines";
 import { areaOf, polygonsOf } from "./plan";
 
 const ABOVE_GROUND_M = 0.25;
@@ -17,7 +17,7 @@ export function flatOutlines(
   status: "failed" | "rejected",
   frame: SceneFrame,
   groundAt: (x: number, y: number) => number,
-): { batches: Batch[]; outlines: Outlines } {
+): { batches: Batch[]; outlines: Outline[] } {
   const batcher = new Batcher({ origin: [0, 0, 0], horizontalUnitM: 1, verticalUnitM: 1 });
   for (const { geometry, properties, id } of features) {
     const name = properties["building_id"] ?? properties["object_id"] ?? id;

@@ -3,7 +3,7 @@
 import { jsonLines } from "../api/lines";
 import { Batcher, type Batch, type Listed } from "./batching";
 import { SequenceReader, type Building } from "./cityjson";
-import type { Outlines } from "./outlines";
+import type { Outline } from "./outlines";
 
 /** A piece of the CityJSONSeq for the worker. */
 export interface ToLoading {
@@ -22,7 +22,7 @@ export type Reading = Omit<ToLoading, "bytes">;
 /** Messages of the worker. */
 export type FromLoading =
   | { kind: "frame"; origin: [number, number, number] }
-  | { kind: "buildings"; listed: Listed[]; batches: Batch[]; outlines: Outlines }
+  | { kind: "buildings"; listed: Listed[]; batches: Batch[]; outlines: Outline[] }
   /** The levels of detail to choose from, coarse to fine; empty if each building has one. */
   | { kind: "finished"; levels: string[] }
   | { kind: "failed"; detail: string };
@@ -62,8 +62,7 @@ async function read({ horizontalUnitM, verticalUnitM, lod }: Reading): Promise<v
   const give = (): void => {
     if (batcher === null) return;
     const batches = batcher.take();
-    const outlines = batcher.takeOutlines();
-    tell({ kind: "buildings", listed, batches, outlines }, [...batches, outlines].flatMap(buffersOf));
+    tell({ kind: "buildings", listed, batches, outlines: batcher.takeOutlines() }, batches.flatMap(buffersOf));
     listed = [];
   };
   for await (const line of jsonLines(arriving())) {
@@ -99,9 +98,9 @@ function originOf(reader: SequenceReader, { vertices }: Building): [number, numb
   return [Math.round(vertices[0]), Math.round(vertices[1]), Math.floor(vertices[2])];
 }
 
-/** What is handed over and not copied: the arrays of a batch or of outlines. */
-function buffersOf(packed: Batch | Outlines): Transferable[] {
-  return Object.values(packed).flatMap((value) => (ArrayBuffer.isView(value) ? [value.buffer as ArrayBuffer] : []));
+/** What is handed over and not copied: the arrays of a batch. */
+function buffersOf(batch: Batch): Transferable[] {
+  return Object.values(batch).flatMap((value) => (ArrayBuffer.isView(value) ? [value.buffer as ArrayBuffer] : []));
 }
 
 function tell(message: FromLoading, transfer: Transferable[] = []): void {

@@ -3,53 +3,26 @@ import { inScene, type SceneFrame } from "./building_mesh";
 import type { Building } from "./cityjson";
 import { areaOf, type Point } from "./plan";
 
-/** The outlines of many objects in plan, packed so that they can be handed from a worker to the page. */
-export interface Outlines {
-  ids: string[];
-  categories: Category[];
-  /** Ring at which each object begins, and the number of rings. */
-  shapeStarts: Uint32Array;
-  /** Point at which each ring begins, and the number of points. */
-  ringStarts: Uint32Array;
+/** The outline of an object in plan. */
+export interface Outline {
+  id: string;
+  category: Category;
   /**
-   * Easting and northing of the points in metres around the scene's origin. Rings are not closed; outer ones run
-   * counter-clockwise, holes clockwise.
+   * Easting and northing of each ring's points, one after another, in metres around the scene's origin. Rings are not
+   * closed; outer ones run counter-clockwise, holes clockwise.
    */
-  xy: Float32Array;
+  rings: Float32Array[];
 }
 
-/** Gathers outlines: the ground surfaces of models, or the faces of flat objects. */
-export class OutlinesInMaking {
-  private readonly ids: string[] = [];
-  private readonly categories: Category[] = [];
-  private readonly shapeStarts = [0];
-  private readonly ringStarts = [0];
-  private readonly xy: number[] = [];
-
-  add(building: Building, category: Category, frame: SceneFrame): void {
-    const vertices = inScene(building.vertices, frame);
-    const wanted = isFlat(category) ? "roof" : "ground";
-    for (const { kind, rings } of building.faces) {
-      if (kind !== wanted) continue;
-      rings.forEach((ring, place) => {
-        const places = ring.map((corner): Point => [vertices[3 * corner], vertices[3 * corner + 1]]);
-        if (areaOf(places) < 0 !== place > 0) places.reverse();
-        this.xy.push(...places.flat());
-        this.ringStarts.push(this.xy.length / 2);
-      });
-    }
-    this.ids.push(building.id);
-    this.categories.push(category);
-    this.shapeStarts.push(this.ringStarts.length - 1);
-  }
-
-  packed(): Outlines {
-    return {
-      ids: this.ids,
-      categories: this.categories,
-      shapeStarts: Uint32Array.from(this.shapeStarts),
-      ringStarts: Uint32Array.from(this.ringStarts),
-      xy: Float32Array.from(this.xy),
-    };
-  }
+/** The outline of a building: the ground surfaces of its model, or the faces of a flat object. */
+export function outlineOf({ id, vertices: coordinates, faces }: Building, category: Category, frame: SceneFrame): Outline {
+  const vertices = inScene(coordinates, frame);
+  const wanted = isFlat(category) ? "roof" : "ground";
+  const ringOf = (ring: readonly number[], isHole: boolean): Float32Array => {
+    const places = ring.map((corner): Point => [vertices[3 * corner], vertices[3 * corner + 1]]);
+    if (areaOf(places) < 0 !== isHole) places.reverse();
+    return Float32Array.from(places.flat());
+  };
+  const shown = faces.filter(({ kind }) => kind === wanted);
+  return { id, category, rings: shown.flatMap(({ rings }) => rings.map((ring, place) => ringOf(ring, place > 0))) };
 }

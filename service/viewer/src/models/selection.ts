@@ -1,6 +1,6 @@
 /** Which objects of a result are shown, and in which order; the address holds it, so a link shows the same. */
 
-import { reasonWords } from "../words/reasons";
+import { reasonWords } from "../words/fields";
 import { CATEGORIES, CATEGORY_NAMES, type Category } from "../words/roof_types";
 import type { Listed } from "./batching";
 import { FIGURE_NAMES, FLAG_NAMES, type FigureName, type Flag } from "./figures";

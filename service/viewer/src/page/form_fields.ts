@@ -23,7 +23,22 @@ export function choice(id: string, options: Record<string, string>, chosen?: str
 export function controlOf(schema: SettingSchema, id: string, value: string, more: Record<string, string> = {}): HTMLInputElement | HTMLSelectElement {
   const words = schema.enum ?? (schema.type === "boolean" ? ["true", "false"] : null);
   if (words === null) return el("input", { type: "text", id, value, autocomplete: "off" });
-  return choice(id, { ...more, ...Object.fromEntries(words.map((word) => [word, word])) }, value);
+  return choice(id, { ...more, ...Object.fromEntries(words.map((word) => [word, more[word] ?? word])) }, value);
+}
+
+/** The value of a text; a text that does not fit stays a text, and the service says what is wrong with it. */
+export function valueOf(text: string, { type }: SettingSchema): unknown {
+  const trimmed = text.trim();
+  if (type === "boolean" && (trimmed === "true" || trimmed === "false")) return trimmed === "true";
+  if (type === "array") return trimmed.split(",").map((part) => number(part.trim()));
+  return type === "string" ? trimmed : number(trimmed);
+}
+
+/** A value as the text of a field. */
+export const textOf = (value: unknown): string => (Array.isArray(value) ? value.join(", ") : String(value ?? ""));
+
+function number(text: string): number | string {
+  return text !== "" && Number.isFinite(Number(text)) ? Number(text) : text;
 }
 
 /** A form whose fields filter a list; it searches when one of them was changed. */
@@ -45,10 +60,6 @@ export class Boxes {
     const words = Object.keys(labels);
     this.boxes = words.map((value) => el("input", { type: "checkbox", value, checked: chosen.includes(value) }));
     this.element.replaceChildren(...this.boxes.map((box) => el("label", {}, box, ` ${labels[box.value]}`)));
-  }
-
-  get isEmpty(): boolean {
-    return this.boxes.length === 0;
   }
 
   get chosen(): string[] {

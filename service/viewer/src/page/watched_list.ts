@@ -20,14 +20,14 @@ export interface Answer {
 export interface ListKind {
   /** For screen readers. */
   name: string;
+  /** What an entry is. */
+  noun: string;
   /** At the service. */
   path: string;
   /** The member of an answer that holds the entries. */
   member: string;
   /** Its address on the page. */
   words: readonly string[];
-  /** The members of an address that filter it, likewise at the service. */
-  filters: readonly string[];
   refreshMs: number;
 }
 
@@ -39,6 +39,8 @@ export abstract class WatchedList<T> extends Watching implements View {
   protected readonly frame = el("div");
   protected readonly pages = el("div");
   protected abstract readonly columns: readonly Column<T>[];
+  /** The members of an address that filter it, likewise at the service, with their controls; null for none. */
+  protected abstract readonly filters: Readonly<Record<string, HTMLInputElement | HTMLSelectElement | null>>;
   private shown = "";
 
   constructor(private readonly kind: ListKind) {
@@ -47,6 +49,10 @@ export abstract class WatchedList<T> extends Watching implements View {
 
   follow({ query }: Address): void {
     this.query = Object.fromEntries(query);
+    for (const [name, control] of Object.entries(this.filters)) {
+      // what is being typed is newer than the address
+      if (control !== null && (control.type !== "search" || document.activeElement !== control)) control.value = query.get(name) ?? "";
+    }
     this.refresh();
   }
 
@@ -56,13 +62,14 @@ export abstract class WatchedList<T> extends Watching implements View {
     void this.load();
   }
 
-  /** Words in place of a list without entries. */
-  protected abstract empty(): (Node | string)[];
-
-  /** Words in place of a list of which a filter leaves none. */
-  protected filtered(): (Node | string)[] {
-    return this.empty();
+  /** The address of the list that the controls ask for, from its first page. */
+  protected asked(): string {
+    const given = Object.entries(this.filters).map(([name, control]) => [name, control?.value.trim() ?? this.query[name] ?? ""]);
+    return hashOf(this.kind.words, Object.fromEntries(given));
   }
+
+  /** Words in place of a list without entries. */
+  protected abstract readonly empty: string;
 
   /** Whether an entry may change by itself. */
   protected abstract mayChange(entry: T): boolean;
@@ -73,9 +80,9 @@ export abstract class WatchedList<T> extends Watching implements View {
   }
 
   protected async read(signal: AbortSignal, isAsked: boolean): Promise<boolean> {
-    const { path, member, filters } = this.kind;
+    const { path, member } = this.kind;
     const offset = offsetOf(this.query["offset"]);
-    const given = filters.map((name) => [name, this.query[name] ?? ""]).filter(([, value]) => value !== "");
+    const given = Object.keys(this.filters).map((name) => [name, this.query[name] ?? ""]).filter(([, value]) => value !== "");
     const asked = new URLSearchParams([["limit", String(SIZE)], ["offset", String(offset)], ...given]);
     const answer = await getJson<Answer>(`${path}?${asked}`, { signal });
     if (signal.aborted) return false;
@@ -92,10 +99,11 @@ export abstract class WatchedList<T> extends Watching implements View {
   }
 
   private draw(answer: Answer, entries: readonly T[], offset: number, isFiltered: boolean): void {
-    const { name, words } = this.kind;
+    const { name, noun, words } = this.kind;
     if (entries.length > 0) refill(this.frame, table(name, this.columns, entries));
     else if (offset > 0) refill(this.frame, nothing("There is nothing on this page. ", el("a", { href: hashOf(words, { ...this.query, offset: "" }) }, "First page")));
-    else refill(this.frame, nothing(...(isFiltered ? this.filtered() : this.empty())));
+    else if (isFiltered) refill(this.frame, nothing(`No ${noun} fits. `, el("a", { href: hashOf(words) }, `Show all ${noun}s`)));
+    else refill(this.frame, nothing(this.empty));
     const page = { offset, size: SIZE, shown: entries.length, total: answer.numberMatched ?? null, hasNext: hasNext(answer) };
     this.pages.replaceChildren(pager(page, words, this.query));
   }

@@ -2,7 +2,7 @@ import type { Listed } from "../models/batching";
 import { FIGURES, figureWords, type FigureName } from "../models/figures";
 import { el, swatch } from "../page/elements";
 import { count } from "../words/numbers";
-import { reasonWords } from "../words/reasons";
+import { reasonWords } from "../words/fields";
 import { CATEGORIES } from "../words/roof_types";
 import "./building_list.css";
 

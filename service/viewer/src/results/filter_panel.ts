@@ -3,9 +3,8 @@ import { FIGURE_NAMES, FIGURES, FLAG_NAMES, FLAGS, type FigureName } from "../mo
 import { isFiltered, SORTS, STATUSES, unfiltered, type Range, type Sort, type Wanted } from "../models/selection";
 import { button, el, setPressed, swatch } from "../page/elements";
 import { Tick } from "../page/tick";
-import { capital } from "../words/fields";
+import { capital, reasonWords } from "../words/fields";
 import { count } from "../words/numbers";
-import { reasonWords } from "../words/reasons";
 import { CATEGORIES, type Category } from "../words/roof_types";
 import { tallyWords } from "./building_list";
 import "./filter_panel.css";

@@ -10,9 +10,8 @@ import { FIGURES, figureWords, type FigureName } from "../models/figures";
 import { el, swatch } from "../page/elements";
 import { report, warningNotice } from "../page/notices";
 import { facts } from "../page/tables";
-import { capital } from "../words/fields";
+import { capital, reasonWords } from "../words/fields";
 import { measure } from "../words/numbers";
-import { reasonWords } from "../words/reasons";
 import { CATEGORIES, categoryOf, type Category } from "../words/roof_types";
 
 type Properties = Feature["properties"];

@@ -8,7 +8,7 @@ import type { Batch, Listed } from "../models/batching";
 import { outlineColour, type Colouring } from "../models/colouring";
 import { flatOutlines } from "../models/failed_footprints";
 import { FIGURE_NAMES } from "../models/figures";
-import type { Outlines } from "../models/outlines";
+import type { Outline } from "../models/outlines";
 import { RunObjects } from "../models/run_objects";
 import { isFiltered, queryWith, selected, tallies, USUAL, wantedOf, type Wanted } from "../models/selection";
 import { elevationUnitM } from "../models/units";
@@ -188,7 +188,7 @@ class ResultsView {
     announce(`LoD${lod} is shown.`);
   }
 
-  private take(listed: Listed[], outlines: Outlines): void {
+  private take(listed: Listed[], outlines: Outline[]): void {
     this.objects.add(listed);
     this.map.add(outlines);
     this.apply();

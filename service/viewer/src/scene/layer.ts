@@ -14,8 +14,8 @@ export interface Tool {
 export interface Layer {
   readonly object: Object3D;
   /** Called before each frame; the height of the view is in device pixels. */
-  update(camera: PerspectiveCamera, heightPx: number): void;
+  update?(camera: PerspectiveCamera, heightPx: number): void;
   /** The nearest thing along a ray up to a distance, within `reach` metres per metre of distance beside it. */
-  pick(ray: Ray, reach: number, farthest: number): Vector3 | null;
+  pick?(ray: Ray, reach: number, farthest: number): Vector3 | null;
   dispose(): void;
 }

@@ -179,7 +179,7 @@ export class ModelScene {
     camera.setPlanes(boxDistance(models.shown(), camera.view.position));
     models.fade(this.canvas.clientHeight / (2 * camera.distance * TAN_HALF_FOV));
     const heightPx = this.renderer.getDrawingBufferSize(new Vector2()).y;
-    for (const layer of this.layers) layer.update(camera.view, heightPx);
+    for (const layer of this.layers) layer.update?.(camera.view, heightPx);
     const began = performance.now();
     this.renderer.render(this.scene, camera.view);
     const { render } = this.renderer.info;
@@ -227,8 +227,8 @@ export class ModelScene {
     const surface = Math.min(this.models.first(ray)?.distance ?? Infinity, ground);
     const metresPerPixel = (2 * TAN_HALF_FOV) / Math.max(this.canvas.clientHeight, 1); // at a distance of one metre
     for (const layer of this.layers) {
-      const point = layer.pick(ray, POINT_PX * metresPerPixel, surface + BEHIND_M);
-      if (point !== null) return point;
+      const point = layer.pick?.(ray, POINT_PX * metresPerPixel, surface + BEHIND_M);
+      if (point != null) return point;
     }
     const place = surface === Infinity ? null : ray.at(surface, new Vector3());
     return this.cornerAt(clientX, clientY) ?? place;

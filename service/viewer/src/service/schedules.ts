@@ -3,13 +3,8 @@
 import type { ScheduleRun } from "../api/types";
 import { counted } from "../words/numbers";
 
-export const OUTCOME_WORDS: Record<string, string> = {
-  submitted: "started",
-  waiting: "waiting",
-  skipped: "skipped",
-  missed: "missed",
-  failed: "failed",
-};
+/** What became of a time, in the words of the page. */
+export const outcomeWords = (outcome: string): string => (outcome === "submitted" ? "started" : outcome);
 
 /** How a run came about, or how many times were missed together. */
 export function slotWords({ trigger, slots, moreSlots }: ScheduleRun): string {
@@ -21,7 +16,7 @@ export function slotWords({ trigger, slots, moreSlots }: ScheduleRun): string {
 export function countWords(counts: Readonly<Record<string, number>>): string {
   return Object.entries(counts)
     .filter(([, number]) => number > 0)
-    .map(([outcome, number]) => `${number} ${OUTCOME_WORDS[outcome] ?? outcome}`)
+    .map(([outcome, number]) => `${number} ${outcomeWords(outcome)}`)
     .join(", ");
 }
 

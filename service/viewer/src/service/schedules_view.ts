@@ -16,7 +16,7 @@ import { hasNext, SIZE, WatchedList, type Answer } from "../page/watched_list";
 import { WatchedPage } from "../page/watched_page";
 import { ago } from "../words/numbers";
 import { showNewSchedule, TimeFields } from "./schedule_form";
-import { clockWords, countWords, OUTCOME_WORDS, slotWords, tileLines } from "./schedules";
+import { clockWords, countWords, outcomeWords, slotWords, tileLines } from "./schedules";
 
 const REFRESH_MS = 10_000;
 
@@ -85,17 +85,14 @@ class ScheduleList extends WatchedList<Schedule> {
     { head: "Last time", kind: "only-wide", cell: ({ lastRun }) => (lastRun === undefined ? "–" : [outcomeChip(lastRun), ` ${ago(lastRun.at)}`]) },
     { head: "Actions", kind: "acts", cell: (one) => scheduleMenu(one, () => this.load(), () => void this.load()) },
   ];
+  protected readonly empty = "No schedules yet. Make one from a job that went well: Actions, Repeat on a schedule.";
+  protected readonly filters = {};
 
   constructor(place: HTMLElement) {
-    const words = ["schedules"];
-    super({ name: "Schedules", path: "schedules", member: "schedules", words, filters: [], refreshMs: REFRESH_MS });
+    super({ name: "Schedules", noun: "schedule", path: "schedules", member: "schedules", words: ["schedules"], refreshMs: REFRESH_MS });
     const make = el("a", { class: "button", href: "#/schedules/new" }, "New schedule…");
     const hint = el("p", { class: "hint" }, "Jobs that the service repeats by itself at fixed times.");
     place.replaceChildren(sheet("Schedules", [make], hint, this.note, this.frame, this.pages));
-  }
-
-  protected empty(): string[] {
-    return ["No schedules yet. Make one from a job that went well: Actions, Repeat on a schedule."];
   }
 
   protected mayChange(): boolean {
@@ -181,4 +178,4 @@ const nameOf = (one: Schedule): string => one.title ?? `Schedule ${one.scheduleI
 
 const nextWords = ({ nextTimes: [next], timeZone }: Schedule): string => (next === undefined ? "–" : clockWords(next, timeZone));
 
-const outcomeChip = ({ outcome }: ScheduleRun): HTMLElement => chip(outcome, OUTCOME_WORDS[outcome]);
+const outcomeChip = ({ outcome }: ScheduleRun): HTMLElement => chip(outcome, outcomeWords(outcome));

@@ -223,12 +223,13 @@ class Log extends WatchedList<Delivery> {
   private readonly state = choice("log-state", { "": "any", ...DELIVERY_WORDS });
   private readonly receiver = choice("log-receiver", { "": "any" });
   private readonly job = el("input", { type: "text", id: "log-job", autocomplete: "off", spellcheck: "false" });
+  protected readonly empty = "No messages yet: no job has named a receiver, or nothing has happened since.";
+  protected readonly filters = { job: this.job, state: this.state, webhook: this.receiver };
 
   constructor(private readonly nameOf: (webhook: string) => string | null) {
-    const filters = ["job", "state", "webhook"];
-    super({ name: "Messages", path: "webhooks/deliveries", member: "deliveries", words: ["webhooks"], filters, refreshMs: REFRESH_MS });
+    super({ name: "Messages", noun: "message", path: "webhooks/deliveries", member: "deliveries", words: ["webhooks"], refreshMs: REFRESH_MS });
     const search = (): void => {
-      location.hash = hashOf(["webhooks"], { job: this.job.value.trim(), state: this.state.value, webhook: this.receiver.value });
+      location.hash = this.asked();
     };
     const form = searchForm("Messages", search, field("Id of the job", this.job), field("State", this.state), field("Receiver", this.receiver));
     this.element = section("log-title", "Messages", form, this.note, this.frame, this.pages);
@@ -240,22 +241,6 @@ class Log extends WatchedList<Delivery> {
     this.receiver.replaceChildren(...options.map(([value, label]) => el("option", { value }, label)));
     this.receiver.value = this.query["webhook"] ?? "";
     this.refresh();
-  }
-
-  override follow(address: Address): void {
-    const { query } = address;
-    this.job.value = query.get("job") ?? "";
-    this.state.value = query.get("state") ?? "";
-    this.receiver.value = query.get("webhook") ?? "";
-    super.follow(address);
-  }
-
-  protected empty(): string[] {
-    return ["No messages yet: no job has named a receiver, or nothing has happened since."];
-  }
-
-  protected override filtered(): (Node | string)[] {
-    return ["No message fits. ", el("a", { href: "#/webhooks" }, "Show all messages")];
   }
 
   protected mayChange({ state }: Delivery): boolean {

@@ -1,22 +1,12 @@
-/** Large files that were not sent to their end, as this browser remembers them. */
+/** Files that were not sent to their end, as this browser remembers them. */
 
+import { defaultOptions, type UrlStorage } from "tus-js-client";
 import { authorization, serviceUrl } from "../api/requests";
-
-const PREFIX = "gablework.upload.";
-
-/** What is stored about an upload; the names are those of tus-js-client. */
-export interface Remembered {
-  size: number | null;
-  metadata: Record<string, string>;
-  creationTime: string;
-  urlStorageKey: string;
-  uploadUrl: string | null;
-  parallelUploadUrls: string[] | null;
-}
 
 /** An upload that waits for its file. */
 export interface Interrupted {
   key: string;
+  url: string;
   name: string;
   size: number;
   /** Bytes that the service has. */
@@ -24,46 +14,30 @@ export interface Interrupted {
 }
 
 /** The same for the same file on the same service, as far as a page can know. */
-export const fingerprint = (file: File): string => [file.name, file.size, file.lastModified, serviceUrl("")].join("|");
+export const fingerprint = (file: File): string => [serviceUrl(""), file.name, file.size, file.lastModified].join("|");
 
-export const keyOf = (mark: string): string => `${PREFIX}${mark}`;
+/** The beginning of the keys under which the library stores uploads of such a fingerprint. */
+export const keyOf = (mark: string): string => `tus::${mark}`;
 
-/** The storage of tus-js-client, one entry per file. A browser may refuse to store anything: then nothing is remembered. */
-export const memory = {
-  findAllUploads: async (): Promise<Remembered[]> => {
+const stored = defaultOptions.urlStorage;
+
+/** The storage of the library, which would also forget an upload for which a key is missing, and fail where it is full. */
+export const memory: UrlStorage = {
+  findAllUploads: () => stored.findAllUploads(),
+  findUploadsByFingerprint: (mark) => stored.findUploadsByFingerprint(mark),
+  removeUpload: async () => undefined,
+  addUpload: async (mark, upload) => {
     try {
-      return Object.keys(localStorage).flatMap((key) => (key.startsWith(PREFIX) ? read(key) : []));
+      return await stored.addUpload(mark, upload);
     } catch {
-      return [];
+      return ""; // the upload itself goes on
     }
-  },
-  findUploadsByFingerprint: async (mark: string): Promise<Remembered[]> => read(keyOf(mark)),
-  removeUpload: async (key: string): Promise<void> => {
-    try {
-      localStorage.removeItem(key);
-    } catch {
-      return;
-    }
-  },
-  addUpload: async (mark: string, upload: Remembered): Promise<string> => {
-    const key = keyOf(mark);
-    try {
-      localStorage.setItem(key, JSON.stringify(upload));
-    } catch {
-      // the upload itself goes on
-      return key;
-    }
-    return key;
   },
 };
 
-function read(key: string): Remembered[] {
-  try {
-    const text = localStorage.getItem(key);
-    return text === null ? [] : [{ ...(JSON.parse(text) as Remembered), urlStorageKey: key }];
-  } catch {
-    return [];
-  }
+/** Forget the uploads of a file here. */
+export async function drop(mark: string): Promise<void> {
+  for (const { urlStorageKey } of await stored.findUploadsByFingerprint(mark)) await stored.removeUpload(urlStorageKey);
 }
 
 /** The path of an upload on this service; its stored address may be that of a proxy. */
@@ -75,17 +49,19 @@ const asking = (method: string, url: string): Promise<Response> =>
 /** The uploads that can be continued; those that the service has no longer are forgotten. */
 export async function interrupted(): Promise<Interrupted[]> {
   const found: Interrupted[] = [];
-  for (const { urlStorageKey: key, metadata, size, uploadUrl } of await memory.findAllUploads()) {
-    const answer = uploadUrl === null ? null : await asking("HEAD", uploadUrl).catch(() => null);
-    if (answer?.status === 404) await memory.removeUpload(key);
+  for (const { urlStorageKey: key, metadata, size, uploadUrl: url } of await stored.findAllUploads()) {
+    // other pages of this host may use the same library
+    if (url === null || !key.startsWith(keyOf(serviceUrl("")))) continue;
+    const answer = await asking("HEAD", url).catch(() => null);
+    if (answer?.status === 404) await stored.removeUpload(key);
     const offset = Number(answer?.headers.get("Upload-Offset") ?? Number.NaN);
-    if (answer?.ok === true && offset > 0) found.push({ key, name: metadata["filename"] ?? "", size: size ?? 0, offset });
+    if (answer?.ok === true && offset > 0) found.push({ key, url, name: metadata["filename"] ?? "", size: size ?? 0, offset });
   }
   return found;
 }
 
 /** Remove an upload here and on the service. */
-export async function forget(key: string): Promise<void> {
-  for (const { uploadUrl } of read(key)) if (uploadUrl !== null) await asking("DELETE", uploadUrl).catch(() => null);
-  await memory.removeUpload(key);
+export async function forget({ key, url }: Interrupted): Promise<void> {
+  await asking("DELETE", url).catch(() => null);
+  await stored.removeUpload(key);
 }

@@ -2,128 +2,62 @@
 
 import { getJson, variantOf } from "../api/requests";
 import type { InputDescription } from "../api/types";
-import { levelsOffered, levelWords, lodsInput } from "../models/levels_of_detail";
 import { el } from "../page/elements";
-import { Boxes, choice, field } from "../page/form_fields";
-import { TABLES } from "../words/tables";
+import { changed, inputFields, type InputFields } from "./input_fields";
 
-const LABELS = TABLES.inputs;
-
-/** Inputs with a field of their own, or without one; all others get a field by their type. */
-const KNOWN = new Set([
-  "tiles", "footprints", "footprintsLayer", "guides", "crs", "allowOutsideAreaOfUse", "method", "preset", "lods", "publish", "settings", "title",
-]);
-
-/** What the options make of a job. */
-export interface Asked {
-  process: "reconstruct" | "compare";
-  inputs: Record<string, unknown>;
-}
+type Described = Record<string, InputDescription>;
 
 export class Options {
-  readonly element = el("details", { class: "options" });
-  private readonly layer = el("input", { id: "footprints-layer", type: "text", list: "footprints-layers", autocomplete: "off" });
-  private readonly layers = el("datalist", { id: "footprints-layers" });
-  private readonly layerField = field(LABELS.footprintsLayer, this.layer, "Only where the file has several.");
-  private readonly crs = el("input", { id: "crs", type: "text", placeholder: "EPSG:28992", autocomplete: "off", spellcheck: "false" });
-  private readonly anywhere = checkbox("anywhere", LABELS.allowOutsideAreaOfUse, "Only if the CRS is right: they are far from where it is used.");
-  private readonly method = choice("method", {});
-  private readonly preset = choice("preset", {});
-  private usualPreset = "";
-  private readonly others = new Boxes();
-  private readonly levels = new Boxes();
-  private readonly levelsHint = el("p", { class: "hint", id: "lods-hint" });
-  private readonly formats = new Boxes();
-  /** The fields of all other inputs, and the value of each that is set. */
-  private readonly further = el("div");
-  private readonly rows = new Map<string, HTMLElement>();
-  private readonly values = new Map<string, () => string | boolean>();
+  readonly element = el("details", { class: "options" }, el("summary", {}, "Options"));
+  private fields: InputFields = new Map();
   private ofComparison = new Set<string>();
-  private readonly title = el("input", { id: "title", type: "text", autocomplete: "off", maxlength: 200 });
+  private readonly layers = el("datalist", { id: "footprints-layers" });
 
   /**
-   * @param footprints The field for footprints and the row of their file; `guides` likewise.
+   * @param files The fields of the files beside the tiles, with the rows of these files.
    * @param onChange Called when a choice may change what is missing.
    */
-  constructor(footprints: readonly HTMLElement[], guides: readonly HTMLElement[], onChange: () => void) {
-    this.element.append(
-      el("summary", {}, "Options"),
-      field(LABELS.crs, this.crs, "If the file has none or a wrong one."),
-      this.anywhere.element,
-      field(LABELS.method, this.method),
-      field(LABELS.preset, this.preset, "Settings that measured better, or those of the method's paper."),
-      group("Levels of detail", this.levels, this.levelsHint),
-      group("Compare with", this.others),
-      ...footprints,
-      this.layerField,
-      this.layers,
-      ...guides,
-      group(LABELS.publish, this.formats),
-      this.further,
-      field(LABELS.title, this.title),
-    );
-    for (const control of [this.method, this.preset, this.levels.element, this.others.element, this.anywhere.box]) {
-      control.addEventListener("change", onChange);
-    }
-    this.crs.addEventListener("input", onChange);
+  constructor(files: readonly HTMLElement[], onChange: () => void) {
+    this.element.append(...files, this.layers);
+    this.element.addEventListener("input", onChange);
   }
 
-  /** Fill the choices from the processes' own descriptions. */
+  /** Make the fields from the processes' own descriptions. */
   async describe(): Promise<void> {
-    const { inputs } = await getJson<{ inputs: Record<string, InputDescription> }>("processes/reconstruct");
-    for (const [select, name] of [[this.method, "method"], [this.preset, "preset"]] as const) {
-      const schema = inputs[name]?.schema;
-      select.replaceChildren(...(schema?.enum ?? []).map((value) => el("option", { value, selected: value === schema?.default }, value)));
-    }
-    this.usualPreset = this.preset.value;
-    const lods = inputs["lods"]?.schema;
-    const level = (value: string): string => `LoD${value}: ${levelWords(value)}`;
-    this.levels.offer(labelled(levelsOffered(lods?.enum ?? []), level), levelsOffered([String(lods?.default ?? "")]));
-    this.formats.offer(labelled(inputs["publish"]?.schema.items?.enum ?? [], (value) => TABLES.formats[value] ?? value));
-    for (const [name, described] of Object.entries(inputs)) if (!KNOWN.has(name)) this.addField(name, described);
-    const comparison = await getJson<{ inputs: Record<string, InputDescription> }>("processes/compare");
-    this.ofComparison = new Set(Object.keys(comparison.inputs));
-    const variants = comparison.inputs["methods"]?.schema.items?.enum ?? [];
-    const named = variants.filter((variant) => !variant.endsWith(`:${this.usualPreset}`));
-    this.others.offer(labelled(named, (value) => value.replace(":", ", ")));
+    const read = async (process: string): Promise<Described> => (await getJson<{ inputs: Described }>(`processes/${process}`)).inputs;
+    const [one, several] = await Promise.all([read("reconstruct"), read("compare")]);
+    this.ofComparison = new Set(Object.keys(several));
+    const usual = `:${String(one["preset"]?.schema.default)}`;
+    const variants = several["methods"]?.schema.items?.enum?.filter((variant) => !variant.endsWith(usual)) ?? [];
+    const methods = { title: "Compare with", description: "Comparisons are made at LoD2.2.", schema: { items: { enum: variants } } };
+    this.fields = inputFields({ ...one, methods });
+    this.fields.get("footprintsLayer")?.element.querySelector("input")?.setAttribute("list", this.layers.id);
+    this.element.append(...[...this.fields.values()].map(({ element }) => element));
   }
 
   /** All methods to run; more than one is a comparison. */
   get variants(): string[] {
-    return [...new Set([this.chosen, ...this.others.chosen])];
+    return [...new Set([this.chosen, ...(this.fields.get("methods")?.boxes?.chosen ?? [])])];
   }
 
   /** Whether a level of detail is still to be chosen. */
   get lacksLevel(): boolean {
-    return this.variants.length === 1 && !this.levels.isEmpty && this.levels.chosen.length === 0;
+    return this.variants.length === 1 && this.fields.get("lods")?.value() === null;
   }
 
   /** Whether tiles that lie far from where their CRS is used are refused. */
   get refusesPlaces(): boolean {
-    return this.crs.value.trim() === "" && !this.anywhere.box.checked;
+    return this.value("crs") === "" && this.value("allowOutsideAreaOfUse") === "";
   }
 
-  /** The inputs of the job beside its files. */
-  asked(usualTitle: string): Asked {
+  /** The process of the job, and its inputs beside its files. */
+  asked(usualTitle: string): { process: "reconstruct" | "compare"; inputs: Record<string, unknown> } {
     const { variants } = this;
-    const inputs: Record<string, unknown> = { title: this.title.value.trim() || usualTitle };
-    const chosen: [string, string][] = [
-      ["crs", this.crs.value.trim()],
-      ["footprintsLayer", this.layerField.hidden ? "" : this.layer.value.trim()],
-    ];
-    if (variants.length > 1) {
-      inputs["methods"] = variants;
-    } else {
-      chosen.push(["method", this.method.value], ["preset", this.preset.value], ["lods", lodsInput(this.levels.chosen)]);
-      if (this.formats.chosen.length > 0) inputs["publish"] = this.formats.chosen;
-    }
-    for (const [name, value] of chosen) if (value !== "") inputs[name] = value;
-    for (const [name, valueOf] of this.values) {
-      const value = valueOf();
-      if (value !== "" && value !== false && (variants.length === 1 || this.ofComparison.has(name))) inputs[name] = value;
-    }
-    if (this.anywhere.box.checked) inputs["allowOutsideAreaOfUse"] = true;
-    return { process: variants.length > 1 ? "compare" : "reconstruct", inputs };
+    const isComparison = variants.length > 1;
+    const takes = (name: string): boolean => (isComparison ? this.ofComparison.has(name) : name !== "methods");
+    const taken = [...this.fields].filter(([name, { element }]) => !element.hidden && takes(name));
+    const inputs = { title: usualTitle, ...changed(taken) };
+    return isComparison ? { process: "compare", inputs: { ...inputs, methods: variants } } : { process: "reconstruct", inputs };
   }
 
   /**
@@ -133,60 +67,24 @@ export class Options {
    * @param layers The layers of the footprints as far as they are known; null without footprints.
    */
   draw(isFar: boolean, layers: readonly string[] | null): void {
+    const isOff: Record<string, boolean> = { allowOutsideAreaOfUse: !isFar, footprintsLayer: layers === null, method: false, preset: false };
     const isComparison = this.variants.length > 1;
-    this.anywhere.element.hidden = !isFar;
-    if (!isFar) this.anywhere.box.checked = false;
-    this.layerField.hidden = layers === null;
+    for (const [name, { element }] of this.fields) element.hidden = isOff[name] ?? (isComparison && !this.ofComparison.has(name));
+    if (!isFar) this.fields.get("allowOutsideAreaOfUse")?.reset();
     this.layers.replaceChildren(...(layers ?? []).map((value) => el("option", { value })));
-    this.levels.disable(() => isComparison);
-    this.formats.disable(() => isComparison);
-    for (const [name, element] of this.rows) element.hidden = isComparison && !this.ofComparison.has(name);
-    this.levelsHint.textContent = isComparison ? "Comparisons are made at LoD2.2." : "One or several; the records describe the finest.";
-    this.others.disable((value) => value === this.chosen);
+    this.fields.get("methods")?.boxes?.disable((value) => value === this.chosen);
   }
 
   /** Forget what was said of the files of the last job. */
   clear(): void {
-    this.layer.value = this.title.value = "";
-    this.anywhere.box.checked = false;
+    for (const name of ["footprintsLayer", "title", "allowOutsideAreaOfUse"]) this.fields.get(name)?.reset();
   }
 
-  /** A field for an input that needs none of its own: a permission, a word of several, or a text. */
-  private addField(name: string, { title = name, description = "", schema }: InputDescription): void {
-    const id = `option-${name}`;
-    const add = (element: HTMLElement, valueOf: () => string | boolean): void => {
-      this.further.append(element);
-      this.rows.set(name, element);
-      this.values.set(name, valueOf);
-    };
-    if (schema.type === "boolean") {
-      const { box, element } = checkbox(id, title, description);
-      add(element, () => box.checked);
-    } else if (schema.enum !== undefined) {
-      const usual: Record<string, string> = schema.default === undefined ? { "": "as in the file" } : {};
-      const words = choice(id, { ...usual, ...labelled(schema.enum, (word) => word) }, String(schema.default ?? ""));
-      add(field(title, words, description), () => (words.value === schema.default ? "" : words.value));
-    } else if (schema.type === "string") {
-      const text = el("input", { id, type: "text", autocomplete: "off" });
-      add(field(title, text, description), () => text.value.trim());
-    }
+  private value(name: string): string {
+    return String(this.fields.get(name)?.value() ?? "");
   }
 
   private get chosen(): string {
-    return variantOf(this.method.value, this.preset.value, this.usualPreset);
+    return variantOf(this.value("method"), this.value("preset"), String(this.fields.get("preset")?.before));
   }
-}
-
-/** A checkbox with a label beside it and a hint below. */
-function checkbox(id: string, label: string, hint: string): { box: HTMLInputElement; element: HTMLElement } {
-  const box = el("input", { id, type: "checkbox", "aria-describedby": `${id}-hint` });
-  return { box, element: el("div", { class: "field" }, el("label", {}, box, ` ${label}`), el("p", { class: "hint", id: `${id}-hint` }, hint)) };
-}
-
-function group(title: string, boxes: Boxes, hint?: HTMLElement): HTMLElement {
-  return el("fieldset", { class: "field", "aria-describedby": hint?.id }, el("legend", {}, title), boxes.element, hint);
-}
-
-function labelled(words: readonly string[], label: (word: string) => string): Record<string, string> {
-  return Object.fromEntries(words.map((word) => [word, label(word)]));
 }

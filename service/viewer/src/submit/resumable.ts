@@ -1,9 +1,9 @@
-/** Large files, by tus: what has arrived is kept. This module and its library are loaded when such a file is sent. */
+/** Sends files by tus: what has arrived is kept, so that they survive a lost network and a reload of the page. */
 
 import { Upload, type DetailedError } from "tus-js-client";
 import { authorization, getJson, Problem, problemOf, serviceUrl } from "../api/requests";
 import type { Preflight, UploadInfo } from "../api/types";
-import { fingerprint, keyOf, memory, placeOf } from "./interrupted";
+import { drop, fingerprint, memory, placeOf } from "./interrupted";
 
 /** Gets how far a file is. */
 export interface ProgressReport {
@@ -13,7 +13,8 @@ export interface ProgressReport {
   waiting(reason: string | null): void;
 }
 
-const PAUSES_S = [0, 1, 3, 5, 10];
+/** Before each further attempt, until one sends a byte; the last pause is repeated for a day. */
+const PAUSES_MS = [0, 1000, 3000, 5000, ...new Array<number>(10_000).fill(10_000)];
 /** Answers of a service in trouble that may pass; others would be the same again. */
 const PASSING = new Set([409, 423, 429, 500, 502, 503, 504]);
 /** Refusals in a row, without a byte in between, after which they count. */
@@ -21,8 +22,12 @@ const PATIENCE = 12;
 /** Refusals after which the service has nothing of the file. */
 const GONE = new Set([400, 404, 410, 413, 415, 422]);
 
-/** As `send`. */
-export function sendResumably(file: File, report: ProgressReport, signal: AbortSignal): Promise<UploadInfo> {
+/**
+ * Send a file.
+ *
+ * @throws Problem when it is refused, AbortError when it is cancelled.
+ */
+export function send(file: File, report: ProgressReport, signal: AbortSignal): Promise<UploadInfo> {
   return new Promise((resolve, reject) => {
     new Sending(file, report, signal, resolve, reject).begin().catch(reject);
   });
@@ -30,11 +35,8 @@ export function sendResumably(file: File, report: ProgressReport, signal: AbortS
 
 class Sending {
   private readonly upload: Upload;
-  private fails = 0;
-  private isPaused = false;
-  private timer: ReturnType<typeof setTimeout> | undefined;
-  private readonly listening = new AbortController();
   private readonly mark: string;
+  private isOver = false;
 
   constructor(
     private readonly file: File,
@@ -48,16 +50,14 @@ class Sending {
       endpoint: serviceUrl("uploads/tus"),
       metadata: { filename: file.name },
       fingerprint: async () => this.mark,
-      // the library would forget an upload for which a key is missing
-      urlStorage: { ...memory, removeUpload: async () => undefined },
-      // the pauses are ours: they end when the network is back, and never for good
-      retryDelays: null,
+      urlStorage: memory,
+      retryDelays: PAUSES_MS,
+      onShouldRetry: (error, attempt) => this.mayPass(error, attempt),
       onBeforeRequest: (request) => {
         for (const [name, value] of Object.entries(authorization())) request.setHeader(name, value);
       },
       onUploadUrlAvailable: () => this.settle(),
       onProgress: (sent, total) => {
-        this.fails = 0;
         report.waiting(null);
         report.progress(total > 0 ? sent / total : 0);
       },
@@ -67,10 +67,7 @@ class Sending {
   }
 
   async begin(): Promise<void> {
-    const options = { signal: this.listening.signal };
-    this.signal.addEventListener("abort", () => this.callOff(), options);
-    window.addEventListener("offline", () => this.pause("The network is away."), options);
-    window.addEventListener("online", () => this.go(), options);
+    this.signal.addEventListener("abort", () => this.callOff());
     const [known] = await memory.findUploadsByFingerprint(this.mark);
     if (known !== undefined) this.upload.resumeFromPreviousUpload(known);
     if (known?.uploadUrl != null) this.settle();
@@ -83,53 +80,45 @@ class Sending {
     this.upload.options.endpoint = null;
   }
 
-  private go(): void {
-    clearTimeout(this.timer);
-    if (!this.isPaused || this.signal.aborted) return;
-    this.isPaused = false;
-    this.upload.start();
+  /** Whether a failure may pass by itself: then it is tried again. */
+  private mayPass({ originalResponse: answer }: DetailedError, attempt: number): boolean {
+    const status = answer?.getStatus() ?? 0;
+    const isPatient = status === 0 || status === 423 || attempt < PATIENCE;
+    if (status !== 0 && !(PASSING.has(status) && isPatient)) return false;
+    if (status === 0) void this.checkFile();
+    const reason = status === 0 ? "The service does not answer." : status === 423 ? "Another page sends it." : "The service is busy.";
+    this.report.waiting(`${reason} It continues by itself.`);
+    return true;
   }
 
-  /** Stop sending; without a time it goes on when the network is back. */
-  private pause(reason: string, pauseS?: number): void {
-    clearTimeout(this.timer);
-    this.isPaused = true;
-    void this.upload.abort();
-    this.report.waiting(`${reason} It continues by itself.`);
-    if (pauseS !== undefined) this.timer = setTimeout(() => this.go(), pauseS * 1000);
+  /** End if the file is no longer what was chosen: browsers report that like a lost network. */
+  private async checkFile(): Promise<void> {
+    try {
+      await this.file.slice(0, 1).arrayBuffer();
+    } catch {
+      void this.upload.abort();
+      this.reject(new Problem(0, "The file cannot be read", `${this.file.name} was moved, removed or changed.`, "Choose it again."));
+    }
   }
 
   private async fail(error: Error | DetailedError): Promise<void> {
-    if (this.signal.aborted) return;
     const answer = "originalResponse" in error ? error.originalResponse : null;
     const status = answer?.getStatus() ?? 0;
+    if (GONE.has(status)) await drop(this.mark);
     if (this.upload.url !== null && (status === 404 || status === 410)) {
       // it has expired, or belongs to another key
-      await memory.removeUpload(keyOf(this.mark));
       this.upload.url = null;
       this.upload.options.endpoint = serviceUrl("uploads/tus");
       this.upload.start();
       return;
     }
-    if (status === 0 && !(await isReadable(this.file))) {
-      this.end(new Problem(0, "The file cannot be read", `${this.file.name} was moved, removed or changed.`, "Choose it again."));
-      return;
-    }
-    this.fails += 1;
-    const isPatient = status === 0 || status === 423 || this.fails <= PATIENCE;
-    if (status !== 0 && !(PASSING.has(status) && isPatient)) {
-      if (GONE.has(status)) await memory.removeUpload(keyOf(this.mark));
-      const retryAfter = answer?.getHeader("Retry-After") ?? null;
-      this.end(problemOf(status, "", answer?.getBody() ?? "", retryAfter));
-      return;
-    }
-    const reason = status === 0 ? "The service does not answer." : status === 423 ? "Another page sends it." : "The service is busy.";
-    this.pause(reason, PAUSES_S[Math.min(this.fails, PAUSES_S.length) - 1]);
+    this.isOver = true;
+    this.reject(answer == null ? error : problemOf(status, "", answer.getBody(), answer.getHeader("Retry-After") ?? null));
   }
 
   private async finish(): Promise<void> {
-    this.listening.abort();
-    await memory.removeUpload(keyOf(this.mark));
+    this.isOver = true;
+    await drop(this.mark);
     try {
       const place = placeOf(this.upload.url ?? "").replace("/tus/", "/");
       const { preflight } = await getJson<{ preflight: Preflight }>(place);
@@ -140,24 +129,10 @@ class Sending {
   }
 
   private callOff(): void {
-    clearTimeout(this.timer);
+    if (this.isOver) return; // a file that has arrived stays on the service
     // also on the service; if it does not answer, the upload expires
     void this.upload.abort(true).catch(() => null);
-    void memory.removeUpload(keyOf(this.mark));
-    this.end(new DOMException("cancelled", "AbortError"));
-  }
-
-  private end(reason: unknown): void {
-    this.listening.abort();
-    this.reject(reason);
-  }
-}
-
-async function isReadable(file: File): Promise<boolean> {
-  try {
-    await file.slice(0, 1).arrayBuffer();
-    return true;
-  } catch {
-    return false;
+    void drop(this.mark);
+    this.reject(new DOMException("cancelled", "AbortError"));
   }
 }

@@ -6,7 +6,10 @@ import { el } from "../page/elements";
 import { announce, asProblem, problemNotice, warningNotice } from "../page/notices";
 import { capital } from "../words/fields";
 import { bytes, count, measure, placeWords } from "../words/numbers";
-import { send, SMALL_BYTES } from "./sending";
+import { send } from "./resumable";
+
+/** Files up to this size are sent within seconds: how far they are needs no words. */
+const SMALL_BYTES = 8_000_000;
 
 /** The calls of a file to its form. */
 export interface FileHooks {

@@ -48,11 +48,11 @@ export class Submission {
       el("span", { class: "hint" }, `or choose files: ${TABLES.endings.tiles.replaceAll(",", " ")}`),
     );
     this.takeDrops(zone);
-    this.options = new Options(
-      this.vectorField("footprints", "GeoPackage, GeoJSON, GeoParquet, FlatGeobuf, GML or a zipped Shapefile: one model per polygon."),
-      this.vectorField("guides", "Lines of roofs that models follow, in the same formats."),
-      () => this.draw(),
-    );
+    const files = [
+      ...this.vectorField("footprints", "GeoPackage, GeoJSON, GeoParquet, FlatGeobuf, GML or a zipped Shapefile: one model per polygon."),
+      ...this.vectorField("guides", "Lines of roofs that models follow, in the same formats."),
+    ];
+    this.options = new Options(files, () => this.draw());
     const title = el("h2", { id: "submission-title" }, "New job");
     const form = el("form", { novalidate: true }, title, picker, zone, this.unfinished.element, this.rows, this.options.element, this.note, this.go);
     form.addEventListener("submit", (event) => {

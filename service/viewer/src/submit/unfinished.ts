@@ -7,7 +7,10 @@ import { fileHead } from "./sent_file";
 
 export class Unfinished {
   readonly element = el("ul", { class: "files", "aria-label": "Interrupted uploads" });
-  private readonly taken = new Set<string>();
+  /** Rows by the keys of their uploads. */
+  private readonly rows = new Map<string, HTMLElement>();
+  /** The beginnings of the keys of chosen files. */
+  private readonly taken: string[] = [];
 
   constructor() {
     void this.offer();
@@ -15,17 +18,21 @@ export class Unfinished {
 
   /** A file was chosen: it does not wait any longer. */
   take(file: File): void {
-    const key = keyOf(fingerprint(file));
-    this.taken.add(key);
-    for (const row of [...this.element.children]) if (row instanceof HTMLElement && row.dataset["key"] === key) row.remove();
+    this.taken.push(keyOf(fingerprint(file)));
+    for (const [key, row] of this.rows) if (this.isTaken(key)) row.remove();
+  }
+
+  private isTaken(key: string): boolean {
+    return this.taken.some((begin) => key.startsWith(begin));
   }
 
   private async offer(): Promise<void> {
-    for (const { key, name, size, offset } of await interrupted()) {
-      if (this.taken.has(key)) continue;
+    for (const one of await interrupted()) {
+      const { key, name, size, offset } = one;
+      if (this.isTaken(key)) continue;
       const remove = (): void => {
         row.remove();
-        void forget(key);
+        void forget(one);
       };
       const row = el(
         "li",
@@ -34,7 +41,7 @@ export class Unfinished {
         el("progress", { max: 1, value: offset / size, "aria-label": `Upload of ${name}` }),
         el("p", { class: "facts" }, `${bytes(offset)} of ${bytes(size)} are sent. Choose the file again to continue.`),
       );
-      row.dataset["key"] = key;
+      this.rows.set(key, row);
       this.element.append(row);
     }
   }

@@ -39,14 +39,6 @@ export class MeasureDrawing implements Layer {
     }
   }
 
-  update(): void {
-    // it changes only by `show`
-  }
-
-  pick(): null {
-    return null;
-  }
-
   dispose(): void {
     this.clear();
     for (const material of [this.casing, this.core, this.legs, this.rim, this.dot]) material.dispose();

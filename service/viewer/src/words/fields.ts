@@ -15,6 +15,11 @@ export function inFields(message: string): string {
     .replace(/,? or raise GABLEWORK_\w+/g, ", or ask the operator of this service to raise the limit");
 }
 
+/** Why an object is not a building, or has no model of its own kind, in plain words. */
+export function reasonWords(reason: string): string {
+  return TABLES.reasons[reason] ?? reason.replaceAll("_", " ");
+}
+
 /** A text that begins with a capital letter. */
 export function capital(text: string): string {
   return text.charAt(0).toUpperCase() + text.slice(1);
