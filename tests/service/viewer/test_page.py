@@ -5,6 +5,7 @@ import json
 import re
 import zipfile
 from collections.abc import Callable
+from decimal import ROUND_HALF_UP, Decimal
 from pathlib import Path
 
 import httpx
@@ -84,7 +85,9 @@ def test_a_dropped_tile_becomes_models_and_a_click_on_one_shows_its_record(
     reported = httpx.get(f"{service}jobs/{job[1]}/buildings/{building}").json()["properties"]
     assert reported["roof_type"] == "gable"
     ridge = record.locator("dt", has_text="Ridge above floor").locator("xpath=following-sibling::dd[1]")
-    expect(ridge).to_have_text(f"{reported['height_m']:.2f}\u202fm")
+    # heights have millimetres, of which a half is rounded up
+    height_m = Decimal(str(reported["height_m"])).quantize(Decimal("0.01"), ROUND_HALF_UP)
+    expect(ridge).to_have_text(f"{height_m}\u202fm")
     expect(record.locator("tbody tr")).to_have_count(reported["n_planes"])
     page.screenshot(path=tmp_path / "record.png")
     assert (opened.pixels() != seen).any(axis=2).mean() > 0.0005, "the chosen building is not marked"
