@@ -194,7 +194,7 @@ def test_weather_of_another_place_is_used_with_a_warning(run_dir: Path, tmp_path
 
 def test_without_a_crs_the_sky_is_known_and_energy_is_refused(run_dir: Path, tmp_path: Path) -> None:
     pytest.importorskip("pvlib")
-    with pytest.raises(RunError, match=r"CRS of the run is unknown.*--crs.*--sky-only"):
+    with pytest.raises(RunError, match=r"CRS of the run is unknown.*again with a CRS, such as EPSG:25832"):
         solar(str(run_dir), str(tmp_path / "year.parquet"))
     assert not (tmp_path / "year.parquet").exists()
     table = sky(run_dir, tmp_path / "sky.parquet")

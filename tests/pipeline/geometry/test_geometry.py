@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from pipeline import geometry
 from pipeline.model import FloatArray
+from pipeline.segmentation import facet_geometry
 
 
 def roof(a: float, b: float, c: float, n: int, noise_m: float, seed: int, side_m: float = 10.0) -> FloatArray:
@@ -26,48 +27,48 @@ def roof(a: float, b: float, c: float, n: int, noise_m: float, seed: int, side_m
 def test_a_facet_of_45_degrees_that_falls_to_the_east_has_its_slope_aspect_and_area() -> None:
     xyz = np.array([[0.0, 0, 1], [1, 0, 0], [1, 1, 0]])
     facets = np.array([[0, 1, 2]], np.int32)
-    normals = geometry.facet_normals(xyz, facets)
+    normals = facet_geometry.facet_normals(xyz, facets)
     np.testing.assert_allclose(normals, [[math.sqrt(0.5), 0, math.sqrt(0.5)]])
-    np.testing.assert_allclose(geometry.slopes_deg(normals), [45])
-    np.testing.assert_allclose(geometry.aspects_deg(normals), [90])
-    np.testing.assert_allclose(geometry.facet_areas_m2(xyz, facets), [math.sqrt(0.5)])
-    np.testing.assert_allclose(geometry.facet_centroids(xyz, facets), [[2 / 3, 1 / 3, 1 / 3]])
-    np.testing.assert_allclose(geometry.o_distances_m(normals, xyz[:1]), [math.sqrt(0.5)])
+    np.testing.assert_allclose(facet_geometry.slopes_deg(normals), [45])
+    np.testing.assert_allclose(facet_geometry.aspects_deg(normals), [90])
+    np.testing.assert_allclose(facet_geometry.facet_areas_m2(xyz, facets), [math.sqrt(0.5)])
+    np.testing.assert_allclose(facet_geometry.facet_centroids(xyz, facets), [[2 / 3, 1 / 3, 1 / 3]])
+    np.testing.assert_allclose(facet_geometry.o_distances_m(normals, xyz[:1]), [math.sqrt(0.5)])
 
 
 def test_normals_point_up_whichever_way_the_facet_turns() -> None:
     xyz = np.random.default_rng(0).uniform(-5, 5, (30, 3))
     facets = np.random.default_rng(1).permuted(np.tile(np.arange(30, dtype=np.int32), (40, 1)), axis=1)[:, :3]
-    normals = geometry.facet_normals(xyz, facets)
+    normals = facet_geometry.facet_normals(xyz, facets)
     assert (normals[:, 2] >= 0).all()
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1)
-    np.testing.assert_allclose(normals, geometry.facet_normals(xyz, facets[:, ::-1]), atol=1e-12)
+    np.testing.assert_allclose(normals, facet_geometry.facet_normals(xyz, facets[:, ::-1]), atol=1e-12)
     expected = np.cross(xyz[facets[:, 1]] - xyz[facets[:, 0]], xyz[facets[:, 2]] - xyz[facets[:, 0]])
-    np.testing.assert_allclose(geometry.facet_areas_m2(xyz, facets), 0.5 * np.linalg.norm(expected, axis=1))
+    np.testing.assert_allclose(facet_geometry.facet_areas_m2(xyz, facets), 0.5 * np.linalg.norm(expected, axis=1))
 
 
 def test_a_vertical_facet_has_90_degrees_and_one_without_area_a_null_normal() -> None:
     xyz = np.array([[0.0, 0, 0], [1, 0, 0], [1, 0, 1], [2, 0, 0]])
     facets = np.array([[0, 1, 2], [0, 1, 3]], np.int32)
-    np.testing.assert_array_equal(geometry.facet_normals(xyz, facets)[1], [0, 0, 0])
-    np.testing.assert_array_equal(geometry.slopes_deg(geometry.facet_normals(xyz, facets)), [90, 90])
+    np.testing.assert_array_equal(facet_geometry.facet_normals(xyz, facets)[1], [0, 0, 0])
+    np.testing.assert_array_equal(facet_geometry.slopes_deg(facet_geometry.facet_normals(xyz, facets)), [90, 90])
 
 
 @pytest.mark.parametrize(
     ("a", "b", "aspect"), [(0, -1, 0), (-1, 0, 90), (0, 1, 180), (1, 0, 270), (0, 0, 0), (1, -1, 315)]
 )
 def test_aspects_follow_the_compass_and_agree_with_the_plane(a: float, b: float, aspect: float) -> None:
-    plane = geometry.fit_plane(np.array([[0.0, 0, 0], [1, 0, a], [0, 1, b], [1, 1, a + b]]))
+    plane = facet_geometry.fit_plane(np.array([[0.0, 0, 0], [1, 0, a], [0, 1, b], [1, 1, a + b]]))
     assert plane.aspect_deg == pytest.approx(aspect)
-    np.testing.assert_allclose(geometry.aspects_deg(np.array([plane.normal])), [aspect], atol=1e-9)
-    np.testing.assert_allclose(geometry.slopes_deg(np.array([plane.normal])), [plane.slope_deg])
+    np.testing.assert_allclose(facet_geometry.aspects_deg(np.array([plane.normal])), [aspect], atol=1e-9)
+    np.testing.assert_allclose(facet_geometry.slopes_deg(np.array([plane.normal])), [plane.slope_deg])
 
 
 def test_the_o_distance_of_facets_is_that_of_their_plane() -> None:
     points = roof(0.3, -0.2, 7.0, 3, 0.0, seed=1) @ np.eye(3)
-    plane = geometry.fit_plane(points)
-    normals = geometry.facet_normals(points, np.array([[0, 1, 2]], np.int32))
-    np.testing.assert_allclose(geometry.o_distances_m(normals, points[:1]), [plane.o_distance_m])
+    plane = facet_geometry.fit_plane(points)
+    normals = facet_geometry.facet_normals(points, np.array([[0, 1, 2]], np.int32))
+    np.testing.assert_allclose(facet_geometry.o_distances_m(normals, points[:1]), [plane.o_distance_m])
 
 
 # ---------------------------------------------------------------------------------------------------------- planes
@@ -78,17 +79,17 @@ def test_the_plane_fit_agrees_with_lstsq() -> None:
         points = roof(0.7, -0.4, 12.0, 5 + 10 * seed, 0.1, seed)
         design = np.column_stack((points[:, :2], np.ones(len(points))))
         expected, _, _, _ = np.linalg.lstsq(design, points[:, 2])
-        plane = geometry.fit_plane(points)
+        plane = facet_geometry.fit_plane(points)
         np.testing.assert_allclose(plane.coefficients, expected, rtol=1e-9, atol=1e-9)
-        residuals = geometry.vertical_residuals_m(points, plane.coefficients)
+        residuals = facet_geometry.vertical_residuals_m(points, plane.coefficients)
         assert plane.rmse_m == pytest.approx(math.sqrt(float((residuals**2).mean())), rel=1e-9)
         assert plane.n_points == len(points)
 
 
 def test_far_from_the_origin_the_fit_loses_no_more_than_a_tenth_of_a_millimetre() -> None:
     points = roof(0.5, 0.25, 3.0, 200, 0.02, seed=4)
-    here = geometry.fit_plane(points)
-    far = geometry.fit_plane(points + np.array([84_000.0, 447_000.0, 0.0]))
+    here = facet_geometry.fit_plane(points)
+    far = facet_geometry.fit_plane(points + np.array([84_000.0, 447_000.0, 0.0]))
     assert (far.a, far.b) == pytest.approx((here.a, here.b), abs=1e-9)
     moved_c = here.c - here.a * 84_000.0 - here.b * 447_000.0
     assert far.c == pytest.approx(moved_c, abs=1e-4)
@@ -97,7 +98,7 @@ def test_far_from_the_origin_the_fit_loses_no_more_than_a_tenth_of_a_millimetre(
 def test_turning_the_points_turns_the_plane() -> None:
     points = roof(0.5, 0.2, 3.0, 80, 0.05, seed=7)
     turned = points[:, [1, 0, 2]] * [-1, 1, 1]  # 90 degrees counter-clockwise
-    plane, other = geometry.fit_plane(points), geometry.fit_plane(turned)
+    plane, other = facet_geometry.fit_plane(points), facet_geometry.fit_plane(turned)
     assert other.coefficients == pytest.approx((-plane.b, plane.a, plane.c))
     assert other.slope_deg == pytest.approx(plane.slope_deg)
 
@@ -106,24 +107,24 @@ def test_turning_the_points_turns_the_plane() -> None:
 def test_collinear_points_give_the_plane_that_is_level_across_their_line(direction: tuple[float, float]) -> None:
     t = np.linspace(0, 2, 9)
     points = np.round(np.column_stack((t * direction[0], t * direction[1], 5 + t)), 3)
-    plane = geometry.fit_plane(points)
+    plane = facet_geometry.fit_plane(points)
     assert plane.a * -direction[1] + plane.b * direction[0] == pytest.approx(0, abs=1e-9)
-    np.testing.assert_allclose(geometry.vertical_residuals_m(points, plane.coefficients), 0, atol=1e-9)
+    np.testing.assert_allclose(facet_geometry.vertical_residuals_m(points, plane.coefficients), 0, atol=1e-9)
 
 
 def test_one_position_gives_a_horizontal_plane_at_the_mean_height() -> None:
-    plane = geometry.fit_plane(np.array([[4.0, 5, 1], [4, 5, 3]]))
+    plane = facet_geometry.fit_plane(np.array([[4.0, 5, 1], [4, 5, 3]]))
     assert plane.coefficients == (0.0, 0.0, 2.0)
     assert plane.rmse_m == 1.0
 
 
 def test_without_points_the_fit_refuses() -> None:
     with pytest.raises(ValueError, match="no points"):
-        geometry.fit_plane(np.empty((0, 3)))
+        facet_geometry.fit_plane(np.empty((0, 3)))
 
 
 def test_residuals_are_vertical() -> None:
-    assert geometry.vertical_residuals_m(np.array([[0.0, 0, 2]]), (1.0, 0.0, 0.0))[0] == 2.0
+    assert facet_geometry.vertical_residuals_m(np.array([[0.0, 0, 2]]), (1.0, 0.0, 0.0))[0] == 2.0
 
 
 # -------------------------------------------------------------------------------------------------- neighbourhoods
@@ -202,7 +203,7 @@ def test_the_spacing_is_robust_against_a_distant_cluster_and_holds_on_lattices()
 def test_spacing_and_noise_of_too_few_points_are_nan() -> None:
     assert math.isnan(geometry.point_spacing_m(np.zeros((1, 3))))
     assert geometry.point_spacing_m(np.array([[0.0, 0, 0], [0, 2, 0]])) > 0
-    assert math.isnan(geometry.noise_sigma_m(np.zeros((3, 3))))
+    assert math.isnan(facet_geometry.noise_sigma_m(np.zeros((3, 3))))
 
 
 @pytest.mark.parametrize("sigma_m", [0.02, 0.05, 0.10])
@@ -210,19 +211,19 @@ def test_the_noise_of_a_gable_is_recovered(sigma_m: float) -> None:
     found = []
     for seed in range(10):
         west, east = roof(0.6, 0, 3, 300, sigma_m, seed), roof(-0.6, 0, 15, 300, sigma_m, seed + 100)
-        found.append(geometry.noise_sigma_m(np.concatenate((west, east + np.array([10.0, 0, 0])))))
+        found.append(facet_geometry.noise_sigma_m(np.concatenate((west, east + np.array([10.0, 0, 0])))))
     assert np.mean(found) == pytest.approx(sigma_m, rel=0.12)
 
 
 def test_noise_is_recovered_from_as_few_as_six_points() -> None:
-    found = [geometry.noise_sigma_m(roof(0.2, 0.1, 0, 6, 0.1, seed)) ** 2 for seed in range(400)]
+    found = [facet_geometry.noise_sigma_m(roof(0.2, 0.1, 0, 6, 0.1, seed)) ** 2 for seed in range(400)]
     assert 0.05 < math.sqrt(np.mean(found)) < 0.30
 
 
 def test_trees_beside_a_roof_do_not_raise_its_noise_beyond_half() -> None:
     tree = np.random.default_rng(5).uniform(0, 6, (150, 3)) + np.array([30.0, 0, 0])
     both = np.concatenate((roof(0.4, 0.1, 5, 500, 0.05, seed=1), tree))
-    assert geometry.noise_sigma_m(both) < 0.075
+    assert facet_geometry.noise_sigma_m(both) < 0.075
 
 
 def slow_top_visible(points: FloatArray) -> list[bool]:
