@@ -33,7 +33,6 @@ import shutil
 from pathlib import Path
 
 from pipeline.compiler import store
-from checkout import ROOT
 
 loaded, saved = store.load, store.save
 
