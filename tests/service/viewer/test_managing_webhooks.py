@@ -6,6 +6,7 @@ import httpx
 import pytest
 from chromium import Visit, at, posted, rows
 from playwright.sync_api import expect
+from processes import wait_for
 from stocked_state import HOOK, Stock
 
 pytestmark = [pytest.mark.slow]
@@ -46,16 +47,6 @@ def test_a_webhook_is_made_shown_with_its_secret_once_and_removed(visit: Open, s
     assert HOOK in [one["url"] for one in httpx.get(f"{url}webhooks").json()["webhooks"]]
 
 
-def test_a_webhook_is_sent_what_it_missed(visit: Open, stocked: Stocked) -> None:
-    url, stock = stocked
-    page = at(visit, url, "#/webhooks").page
-    page.get_by_label("Actions for the map server").click()
-    with page.expect_response(f"**/webhooks/{stock.webhook}/replay") as answered:
-        page.get_by_role("button", name="Send what it missed").click()
-    assert answered.value.status == 202
-    expect(rows(page, "Receivers").filter(has_text="the map server").locator(".chip")).to_have_text("enabled")
-
-
 def test_the_log_of_messages_is_filtered_and_a_message_is_sent_again(visit: Open, stocked: Stocked) -> None:
     url, stock = stocked
     opened = at(visit, url, "#/webhooks")
@@ -83,6 +74,16 @@ def test_the_log_of_messages_is_filtered_and_a_message_is_sent_again(visit: Open
     page.get_by_label("Actions for Delft Oost").click()
     page.get_by_role("link", name="Messages about it").click()
     expect(rows(page, "Messages")).to_have_count(1)
+
+
+def test_a_webhook_is_sent_what_it_missed(visit: Open, stocked: Stocked) -> None:
+    url, stock = stocked
+    page = at(visit, url, "#/webhooks").page
+    page.get_by_label("Actions for the map server").click()
+    with page.expect_response(f"**/webhooks/{stock.webhook}/replay") as answered:
+        page.get_by_role("button", name="Send what it missed").click()
+    assert answered.value.status == 202
+    expect(rows(page, "Receivers").filter(has_text="the map server").locator(".chip")).to_have_text("enabled")
 
 
 def test_the_secret_of_a_key_is_shown_only_when_it_is_asked_for(visit: Open, stocked: Stocked) -> None:
@@ -180,5 +181,6 @@ def test_a_schedule_is_made_from_a_job_paused_changed_run_and_removed(visit: Ope
     menu.click()
     page.get_by_role("button", name="Remove…").click()
     page.get_by_role("dialog").get_by_role("button", name="Remove it").click()
+    expect(page.get_by_role("dialog")).to_have_count(0)
     expect(rows(page, "Schedules").filter(has_text="Workdays")).to_have_count(0)
-    assert httpx.get(f"{url}schedules/{schedule}").status_code == 404
+    wait_for(lambda: httpx.get(f"{url}schedules/{schedule}").status_code == 404, "the end of the schedule")
