@@ -165,7 +165,7 @@ class Readable(Protocol):
         """The ending of the name, with its dot."""
 
     def stat(self) -> FileStatus:
-        """Size and time; raises OSError if there is no such file."""
+        """Size and time; raises OSError if the file is missing."""
 
     def open(self, mode: Literal["rb"], /) -> io.BufferedReader:
         """Its bytes."""

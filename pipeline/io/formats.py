@@ -27,7 +27,7 @@ class PointFormat:
     takes: tuple[str, ...] = ()
     """Fields of `ReadOptions` that the reader takes."""
     count: str = ""
-    """Function that reads the number of points from the header, "module:function"; empty if there is no header."""
+    """Function that reads the number of points from the header, "module:function"; empty without a header."""
     has_bounds: bool = False
     """Whether the header has bounds, so that a file is not read through for them."""
     has_parts: bool = False

@@ -1,4 +1,4 @@
-"""The plane of each place of the plan: labels of all points, and samples where there are no points."""
+"""The plane of each place of the plan: labels of all points, and samples where points are missing."""
 
 from __future__ import annotations
 

@@ -123,7 +123,7 @@ def cluster(vectors: FloatArray, areas_m2: FloatArray, settings: FuzzySartCluste
     """Cluster facet vectors (n, 3), as `facet_vectors` gives them, by Fuzzy SART.
 
     Inputs are presented in descending area, ties by index, epoch after epoch, until no neuron was made or removed, all
-    have lived tau epochs and none moved. Outliers have the label -1; without vectors there are no clusters. Raises
+    have lived tau epochs and none moved. Outliers have the label -1; no vectors give no clusters. Raises
     BuildingError ``too_complex`` where more than ``clustering_work_limit`` comparisons would be needed.
     """
     order = np.argsort(-areas_m2, kind="stable")
