@@ -62,7 +62,6 @@ def mismatch_message(faults: list[str]) -> str:
 def versions_of(line: str) -> dict[str, str]:
     """The versions in a fingerprint.
 
-    >>> from pipeline.runtime.monitoring.versions import fingerprint
     >>> versions_of(fingerprint()) == dict(versions_here())
     True
     >>> versions_of("gablework=0.1.0;numpy=2.1")
