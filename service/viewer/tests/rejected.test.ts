@@ -1,6 +1,7 @@
 // @vitest-environment happy-dom
 import { describe, expect, test } from "vitest";
-import { listedRejected, readRejected } from "../src/models/rejected_objects";
+import { flatOutlines } from "../src/models/failed_footprints";
+import { readRejected } from "../src/models/rejected_objects";
 import { rejectedRecord } from "../src/results/record";
 
 /** Parquet written by pyarrow: two objects, one without a confidence. */
@@ -23,8 +24,9 @@ const bytes = (text: string): ArrayBuffer => Uint8Array.from(atob(text), (letter
 
 /** What the record of each object shows, as text. */
 async function shown(table: string): Promise<string[]> {
-  const features = await readRejected(bytes(table));
-  return features.map((feature) => rejectedRecord(listedRejected(feature)).map(({ textContent }) => textContent).join(" "));
+  const frame = { origin: [0, 0, 0] as const, horizontalUnitM: 1, verticalUnitM: 1 };
+  const { listed } = flatOutlines(await readRejected(bytes(table)), "rejected", frame, () => 0);
+  return listed.map((object) => rejectedRecord(object).map(({ textContent }) => textContent).join(" "));
 }
 
 describe("objects that were left out", () => {

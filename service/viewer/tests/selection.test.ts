@@ -135,8 +135,7 @@ describe("the figures of a record", () => {
   it("are those that it has, whole numbers of 64 bits included", () => {
     const record = { height_m: 7.5, footprint_area_m2: null, n_planes: 2, rmse_m: NaN, n_points: 55n };
     expect(figuresOf(record)).toEqual({ height: 7.5, planes: 2, points: 55 });
-    expect(figuresOf({ area_m2: 4, height_m: 2 }, true)).toEqual({ area: 4, height: 2 });
-    expect(figuresOf({ area_m2: 4 })).toEqual({});
+    expect(figuresOf({ area_m2: 4, height_m: 2 })).toEqual({ area: 4, height: 2 });
   });
 
   it("are shown with their units", () => {

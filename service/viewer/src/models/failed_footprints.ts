@@ -1,5 +1,5 @@
 import type { Feature } from "../api/types";
-import { Batcher, type Batch } from "./batching";
+import { Batcher, type Batch, type Listed } from "./batching";
 import type { SceneFrame } from "./building_mesh";
 import type { Face } from "./cityjson";
 import type { Outline } from "./outlines";
@@ -8,7 +8,7 @@ import { areaOf, polygonsOf } from "./plan";
 const ABOVE_GROUND_M = 0.25;
 
 /**
- * Outlines of objects without a model, as flat faces on the ground.
+ * Outlines of objects without a model, as flat faces on the ground, and the objects as they are listed.
  *
  * @param status The status of all of them: failed or rejected.
  */
@@ -17,8 +17,9 @@ export function flatOutlines(
   status: "failed" | "rejected",
   frame: SceneFrame,
   groundAt: (x: number, y: number) => number,
-): { batches: Batch[]; outlines: Outline[] } {
+): { batches: Batch[]; listed: Listed[]; outlines: Outline[] } {
   const batcher = new Batcher({ origin: [0, 0, 0], horizontalUnitM: 1, verticalUnitM: 1 });
+  const listed: Listed[] = [];
   for (const { geometry, properties, id } of features) {
     const name = properties["building_id"] ?? properties["object_id"] ?? id;
     if (typeof name !== "string") continue;
@@ -39,7 +40,7 @@ export function flatOutlines(
     // a face must be planar
     const top = vertices.reduce((highest, [, , z]) => Math.max(highest, z), -Infinity);
     const level = Float64Array.from(vertices.flatMap(([x, y]) => [x, y, top]));
-    batcher.add({ id: name, attributes: { status, reason: properties["reason"] }, vertices: level, faces, levels: [] });
+    listed.push(batcher.add({ id: name, attributes: { ...properties, status }, vertices: level, faces, levels: [] }));
   }
-  return { batches: batcher.take(), outlines: batcher.takeOutlines() };
+  return { batches: batcher.take(), listed, outlines: batcher.takeOutlines() };
 }

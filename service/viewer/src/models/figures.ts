@@ -45,11 +45,11 @@ export type Flag = keyof typeof FLAGS;
 export const FLAG_NAMES = Object.keys(FLAGS) as Flag[];
 
 /** The known figures of a record. */
-export function figuresOf(record: Record<string, unknown>, rejected = false): Figures {
+export function figuresOf(record: Record<string, unknown>): Figures {
   const figures: Figures = {};
   for (const name of FIGURE_NAMES) {
     const figure: Figure = FIGURES[name];
-    const value = record[rejected ? (figure.ofRejected ?? figure.column) : figure.column];
+    const value = record[figure.column] ?? record[figure.ofRejected ?? ""];
     const number = typeof value === "bigint" ? Number(value) : value; // 64-bit columns of Parquet
     if (typeof number === "number" && Number.isFinite(number)) figures[name] = number;
   }

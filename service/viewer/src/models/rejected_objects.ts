@@ -4,8 +4,6 @@ import { decompress } from "fzstd";
 import { parquetMetadata, parquetReadObjects } from "hyparquet";
 import { partOf, request, type Run } from "../api/requests";
 import type { Feature } from "../api/types";
-import type { Listed } from "./batching";
-import { figuresOf } from "./figures";
 
 /** The columns that are shown; runs of older versions lack some. */
 const COLUMNS = ["object_id", "reason", "reason_detail", "geometry", "area_m2", "height_m", "n_points", "detection_confidence"];
@@ -38,21 +36,4 @@ export async function readRejected(file: ArrayBuffer): Promise<Feature[]> {
     geometry: geometry as Feature["geometry"],
     properties,
   }));
-}
-
-/** The entry of a rejected object in the list. */
-export function listedRejected({ id, properties }: Feature): Listed {
-  const text = (name: string): string | null => {
-    const value = properties[name];
-    return typeof value === "string" && value !== "" ? value : null;
-  };
-  return {
-    id: id ?? "",
-    category: "rejected",
-    reason: text("reason"),
-    reasonDetail: text("reason_detail"),
-    sourceId: null,
-    figures: figuresOf(properties, true),
-    flags: [],
-  };
 }

@@ -12,8 +12,6 @@ type Buildings = Extract<FromLoading, { kind: "buildings" }>;
 
 export class RunObjects implements Run {
   readonly listed: Listed[] = [];
-  /** Those that were left out, by id; they are listed, too. */
-  readonly rejected = new Map<string, Listed>();
   /** Objects by category; those that were left out as the report counts them. */
   readonly counts = new Map<Category, number>();
   report: RunReport = {};
@@ -29,11 +27,6 @@ export class RunObjects implements Run {
   /** The scene in the coordinates of the job. */
   get frame(): SceneFrame {
     return { origin: this.origin ?? [0, 0, 0], ...modelUnits(this.report.crs) };
-  }
-
-  /** Number of objects that are not left out. */
-  get candidates(): number {
-    return this.listed.length - this.rejected.size;
   }
 
   find(id: string): Listed | undefined {
@@ -70,11 +63,10 @@ export class RunObjects implements Run {
     return features;
   }
 
-  /** Read the objects that were left out; they are listed by `add`. */
+  /** Read the objects that were left out. */
   async readRejected(signal: AbortSignal): Promise<Feature[]> {
-    const { listedRejected, rejectedObjects } = await import("./rejected_objects");
+    const { rejectedObjects } = await import("./rejected_objects");
     const features = await rejectedObjects(this, signal);
-    for (const object of features.map(listedRejected)) this.rejected.set(object.id, object);
     this.placeBy(features);
     return features;
   }

@@ -2,27 +2,27 @@
 
 import type { RunReport } from "../api/types";
 import { buildingWords } from "../jobs/job_words";
-import { RunObjects } from "../models/run_objects";
+import type { RunObjects } from "../models/run_objects";
+import { STATUSES } from "../models/selection";
 import { dropDown } from "../page/action_menu";
 import { el } from "../page/elements";
 import { warningNotice } from "../page/notices";
 import { capital } from "../words/fields";
 import { count, counted, duration } from "../words/numbers";
-import type { Category } from "../words/roof_types";
 
 /** The facts of a run in one line: what was found, from how many points, in what time. */
-export function resultFacts({ report, counts, candidates }: RunObjects): (string | HTMLElement)[] {
+export function resultFacts({ report, counts, listed }: RunObjects): (string | HTMLElement)[] {
   const tally = report.counts ?? {};
   const rejected = tally["rejected"];
   const points = tally["points"];
   const seconds = report.timings_s?.["total"];
   const warnings = report.warnings ?? [];
   const crsName = report.crs?.name ?? "unknown";
-  const of = (category: Category): number => counts.get(category) ?? 0;
-  const [doubtful, fallback, failed] = [of("doubtful"), of("fallback"), of("failed")];
-  const ok = candidates - doubtful - fallback - failed;
+  const of = (status: keyof typeof STATUSES): number =>
+    STATUSES[status].categories.reduce((n, category) => n + (counts.get(category) ?? 0), 0);
+  const statuses = { ok: of("ok"), doubtful: of("doubtful"), fallback: of("fallback"), failed: of("failed") };
   const facts = [
-    candidates > 0 ? buildingWords({ ok, doubtful, fallback, failed }) : null,
+    listed.length > 0 ? buildingWords(statuses) : null,
     rejected === undefined ? null : `${count(rejected)} other objects left out`,
     points === undefined ? null : `${count(points)} points`,
     seconds === undefined ? null : duration(seconds),

@@ -228,9 +228,9 @@ class ResultsView {
   /** Draw objects without a model. */
   private takeOutlines(features: readonly Feature[], status: "failed" | "rejected"): void {
     const { scene } = this;
-    const { batches, outlines } = flatOutlines(features, status, this.objects.frame, (x, y) => scene?.groundAt(x, y) ?? 0);
+    const { batches, listed, outlines } = flatOutlines(features, status, this.objects.frame, (x, y) => scene?.groundAt(x, y) ?? 0);
     scene?.add(batches);
-    this.take(status === "rejected" ? [...this.objects.rejected.values()] : [], outlines);
+    this.take(status === "rejected" ? listed : [], outlines);
   }
 
   // --- filters, order and the map
@@ -397,8 +397,8 @@ class ResultsView {
     this.map.select(id, fly);
     if (id === null) return this.panel.showList(before);
     this.panel.showRecord(id, !fly, before === null, (body) => {
-      const object = this.objects.rejected.get(id);
-      if (object === undefined) return showRecord(body, this.objects, id, elevationUnitM(this.objects.report.crs));
+      const object = this.objects.find(id);
+      if (object?.category !== "rejected") return showRecord(body, this.objects, id, elevationUnitM(this.objects.report.crs));
       body.replaceChildren(...rejectedRecord(object));
       return () => undefined;
     });

@@ -3,7 +3,7 @@
 import { Upload, type DetailedError } from "tus-js-client";
 import { authorization, getJson, Problem, problemOf, serviceUrl } from "../api/requests";
 import type { Preflight, UploadInfo } from "../api/types";
-import { drop, fingerprint, memory, placeOf } from "./interrupted";
+import { drop, kept, keyOf, placeOf, remember } from "./interrupted";
 
 /** Gets how far a file is. */
 export interface ProgressReport {
@@ -17,8 +17,8 @@ export interface ProgressReport {
 const PAUSES_MS = [0, 1000, 3000, 5000, ...new Array<number>(10_000).fill(10_000)];
 /** Answers of a service in trouble that may pass; others would be the same again. */
 const PASSING = new Set([409, 423, 429, 500, 502, 503, 504]);
-/** Refusals in a row, without a byte in between, after which they count. */
-const PATIENCE = 12;
+/** Refusals in a row, without a byte in between, after which the upload fails. */
+const MOST_REFUSALS = 12;
 /** Refusals after which the service has nothing of the file. */
 const GONE = new Set([400, 404, 410, 413, 415, 422]);
 
@@ -29,13 +29,13 @@ const GONE = new Set([400, 404, 410, 413, 415, 422]);
  */
 export function send(file: File, report: ProgressReport, signal: AbortSignal): Promise<UploadInfo> {
   return new Promise((resolve, reject) => {
-    new Sending(file, report, signal, resolve, reject).begin().catch(reject);
+    new Sending(file, report, signal, resolve, reject).begin();
   });
 }
 
 class Sending {
   private readonly upload: Upload;
-  private readonly mark: string;
+  private readonly key: string;
   private isOver = false;
 
   constructor(
@@ -45,46 +45,47 @@ class Sending {
     private readonly resolve: (uploaded: UploadInfo) => void,
     private readonly reject: (reason: unknown) => void,
   ) {
-    this.mark = fingerprint(file);
+    this.key = keyOf(file);
     this.upload = new Upload(file, {
       endpoint: serviceUrl("uploads/tus"),
       metadata: { filename: file.name },
-      fingerprint: async () => this.mark,
-      urlStorage: memory,
+      // the library would also forget an upload for which a key is missing
+      storeFingerprintForResuming: false,
       retryDelays: PAUSES_MS,
       onShouldRetry: (error, attempt) => this.mayPass(error, attempt),
       onBeforeRequest: (request) => {
         for (const [name, value] of Object.entries(authorization())) request.setHeader(name, value);
       },
-      onUploadUrlAvailable: () => this.settle(),
+      onUploadUrlAvailable: () => this.settle(this.upload.url),
       onProgress: (sent, total) => {
         report.waiting(null);
         report.progress(total > 0 ? sent / total : 0);
       },
       onSuccess: () => void this.finish(),
-      onError: (error) => void this.fail(error),
+      onError: (error) => this.fail(error),
     });
   }
 
-  async begin(): Promise<void> {
+  begin(): void {
     this.signal.addEventListener("abort", () => this.callOff());
-    const [known] = await memory.findUploadsByFingerprint(this.mark);
-    if (known !== undefined) this.upload.resumeFromPreviousUpload(known);
-    if (known?.uploadUrl != null) this.settle();
-    if (!this.signal.aborted) this.upload.start();
+    this.settle(kept(this.key)?.url ?? null);
+    if (this.signal.aborted) this.callOff();
+    else this.upload.start();
   }
 
-  /** From now on there is an upload: a failed look at it must not begin another one. */
-  private settle(): void {
-    if (this.upload.url !== null) this.upload.url = serviceUrl(placeOf(this.upload.url));
+  /** From now on there is an upload, unless the address is null: a failed look at it must not begin another one. */
+  private settle(url: string | null): void {
+    if (url === null) return;
+    remember(this.file, url);
+    this.upload.url = serviceUrl(placeOf(url));
     this.upload.options.endpoint = null;
   }
 
   /** Whether a failure may pass by itself: then it is tried again. */
   private mayPass({ originalResponse: answer }: DetailedError, attempt: number): boolean {
     const status = answer?.getStatus() ?? 0;
-    const isPatient = status === 0 || status === 423 || attempt < PATIENCE;
-    if (status !== 0 && !(PASSING.has(status) && isPatient)) return false;
+    const isRefused = status !== 423 && attempt >= MOST_REFUSALS;
+    if (status !== 0 && (isRefused || !PASSING.has(status))) return false;
     if (status === 0) void this.checkFile();
     const reason = status === 0 ? "The service does not answer." : status === 423 ? "Another page sends it." : "The service is busy.";
     this.report.waiting(`${reason} It continues by itself.`);
@@ -101,10 +102,10 @@ class Sending {
     }
   }
 
-  private async fail(error: Error | DetailedError): Promise<void> {
+  private fail(error: Error | DetailedError): void {
     const answer = "originalResponse" in error ? error.originalResponse : null;
     const status = answer?.getStatus() ?? 0;
-    if (GONE.has(status)) await drop(this.mark);
+    if (GONE.has(status)) drop(this.key);
     if (this.upload.url !== null && (status === 404 || status === 410)) {
       // it has expired, or belongs to another key
       this.upload.url = null;
@@ -118,7 +119,7 @@ class Sending {
 
   private async finish(): Promise<void> {
     this.isOver = true;
-    await drop(this.mark);
+    drop(this.key);
     try {
       const place = placeOf(this.upload.url ?? "").replace("/tus/", "/");
       const { preflight } = await getJson<{ preflight: Preflight }>(place);
@@ -132,7 +133,7 @@ class Sending {
     if (this.isOver) return; // a file that has arrived stays on the service
     // also on the service; if it does not answer, the upload expires
     void this.upload.abort(true).catch(() => null);
-    void drop(this.mark);
+    drop(this.key);
     this.reject(new DOMException("cancelled", "AbortError"));
   }
 }

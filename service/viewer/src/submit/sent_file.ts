@@ -1,12 +1,11 @@
 /** A file of the form: it is sent at once, and its row shows how far it is and what the service found in it. */
 
-import type { Problem } from "../api/requests";
+import { unreachable, type Problem } from "../api/requests";
 import type { UploadInfo } from "../api/types";
 import { el } from "../page/elements";
 import { announce, asProblem, problemNotice, warningNotice } from "../page/notices";
 import { capital } from "../words/fields";
 import { bytes, count, measure, placeWords } from "../words/numbers";
-import { send } from "./resumable";
 
 /** Files up to this size are sent within seconds: how far they are needs no words. */
 const SMALL_BYTES = 8_000_000;
@@ -74,6 +73,8 @@ export class SentFile {
       },
     };
     try {
+      // the library of uploads is loaded only if there is something to send
+      const { send } = await import("./resumable").catch(() => Promise.reject(unreachable()));
       this.uploaded = await send(file, report, this.calledOff.signal);
       announce(`${file.name} is uploaded. ${this.faults.join(" ")}`);
     } catch (error) {

@@ -1,7 +1,7 @@
 /** The form of a new job: tiles are sent as soon as they are dropped, the job starts on the button. */
 
 import { sendJson, type Problem } from "../api/requests";
-import { el, svg } from "../page/elements";
+import { el, svg, type Properties } from "../page/elements";
 import { field } from "../page/form_fields";
 import { announce, asProblem, problemNotice } from "../page/notices";
 import { TABLES } from "../words/tables";
@@ -9,22 +9,26 @@ import { Options } from "./options";
 import { SentFile, texts } from "./sent_file";
 import { Unfinished } from "./unfinished";
 
-/** Inputs that are one vector file each. */
-const VECTORS = ["footprints", "guides"] as const;
-type Vector = (typeof VECTORS)[number];
+/** Inputs that are files; all but the tiles are one file each. */
+const INPUTS = ["tiles", "footprints", "guides"] as const;
+type FileInput = (typeof INPUTS)[number];
+
+/** The chosen files of an input, and their rows. */
+class Chosen {
+  files: SentFile[] = [];
+  readonly rows = el("ul", { class: "files" });
+
+  clear(): void {
+    this.files = [];
+    this.rows.replaceChildren();
+  }
+}
 
 export class Submission {
-  private tiles: SentFile[] = [];
-  /** Files beside the tiles, one for each of these inputs. */
-  private readonly vectors: Record<Vector, SentFile | null> = { footprints: null, guides: null };
+  private readonly chosen = { tiles: new Chosen(), footprints: new Chosen(), guides: new Chosen() };
   private starting = false;
   /** The service refused the place of a tile by the CRS of the form. */
   private placeRefused = false;
-  private readonly rows = el("ul", { class: "files" });
-  private readonly vectorRows: Record<Vector, HTMLElement> = {
-    footprints: el("ul", { class: "files" }),
-    guides: el("ul", { class: "files" }),
-  };
   private readonly unfinished = new Unfinished();
   private readonly options: Options;
   private readonly note = el("div");
@@ -35,11 +39,7 @@ export class Submission {
     private readonly onSubmitted: (jobId: string) => void,
     private readonly onProblem: (problem: Problem) => void,
   ) {
-    const picker = el("input", { type: "file", id: "tiles", multiple: true, accept: TABLES.endings.tiles, class: "visually-hidden" });
-    picker.addEventListener("change", () => {
-      this.addTiles([...(picker.files ?? [])]);
-      picker.value = "";
-    });
+    const picker = this.picker("tiles", { multiple: true, accept: TABLES.endings.tiles, class: "visually-hidden" });
     const zone = el(
       "label",
       { class: "drop", for: "tiles" },
@@ -54,7 +54,7 @@ export class Submission {
     ];
     this.options = new Options(files, () => this.draw());
     const title = el("h2", { id: "submission-title" }, "New job");
-    const form = el("form", { novalidate: true }, title, picker, zone, this.unfinished.element, this.rows, this.options.element, this.note, this.go);
+    const form = el("form", { novalidate: true }, title, picker, zone, this.unfinished.element, this.chosen.tiles.rows, this.options.element, this.note, this.go);
     form.addEventListener("submit", (event) => {
       event.preventDefault();
       void this.submit();
@@ -87,56 +87,48 @@ export class Submission {
       event.preventDefault();
       depth = 0;
       over(false);
-      this.addTiles([...(event.dataTransfer?.files ?? [])]);
+      this.add("tiles", [...(event.dataTransfer?.files ?? [])]);
     });
   }
 
-  private addTiles(files: File[]): void {
-    for (const file of files) {
-      const sent = this.send(file, () => {
-        this.tiles = this.tiles.filter((other) => other !== sent);
-      });
-      this.tiles.push(sent);
-      this.rows.append(sent.row);
-    }
-    this.draw();
+  private picker(name: FileInput, properties: Properties): HTMLInputElement {
+    const picker = el("input", { type: "file", id: name, ...properties });
+    picker.addEventListener("change", () => {
+      this.add(name, [...(picker.files ?? [])]);
+      picker.value = "";
+    });
+    return picker;
   }
 
   /** The field for the file of an input, and the place of its row. */
-  private vectorField(name: Vector, hint: string): HTMLElement[] {
-    const picker = el("input", { type: "file", id: name, accept: TABLES.endings.vectors });
-    picker.addEventListener("change", () => {
-      const file = picker.files?.[0];
-      if (file !== undefined) this.setVector(name, file);
-      picker.value = "";
-    });
-    return [field(TABLES.inputs[name], picker, hint), this.vectorRows[name]];
+  private vectorField(name: FileInput, hint: string): HTMLElement[] {
+    const picker = this.picker(name, { accept: TABLES.endings.vectors });
+    return [field(TABLES.inputs[name], picker, hint), this.chosen[name].rows];
   }
 
-  private setVector(name: Vector, file: File): void {
-    this.vectors[name]?.stop();
-    const sent = this.send(file, () => {
-      this.vectors[name] = null;
-    });
-    this.vectors[name] = sent;
-    this.vectorRows[name].replaceChildren(sent.row);
+  private add(name: FileInput, files: File[]): void {
+    const chosen = this.chosen[name];
+    if (name !== "tiles" && files.length > 0) {
+      for (const before of chosen.files) before.stop();
+      chosen.clear();
+    }
+    for (const file of files) {
+      this.unfinished.take(file);
+      const sent: SentFile = new SentFile(file, {
+        onEnd: () => {
+          if (sent.faults.length > 0) this.options.element.open = true;
+          this.draw();
+        },
+        onRemove: () => {
+          chosen.files = chosen.files.filter((other) => other !== sent);
+          this.draw();
+        },
+        onProblem: this.onProblem,
+      });
+      chosen.files.push(sent);
+      chosen.rows.append(sent.row);
+    }
     this.draw();
-  }
-
-  private send(file: File, forget: () => void): SentFile {
-    this.unfinished.take(file);
-    const sent: SentFile = new SentFile(file, {
-      onEnd: () => {
-        if (sent.faults.length > 0) this.options.element.open = true;
-        this.draw();
-      },
-      onRemove: () => {
-        forget();
-        this.draw();
-      },
-      onProblem: this.onProblem,
-    });
-    return sent;
   }
 
   // --- the job
@@ -147,12 +139,11 @@ export class Submission {
     this.note.replaceChildren();
     this.draw();
     try {
-      const [first = "", ...others] = this.tiles.map(({ file }) => file.name);
+      const [first = "", ...others] = this.chosen.tiles.files.map(({ file }) => file.name);
       const { process, inputs } = this.options.asked(others.length > 0 ? `${first} and ${others.length} more` : first);
-      inputs["tiles"] = this.tiles.map(({ uploaded }) => ({ href: uploaded?.href }));
-      for (const name of VECTORS) {
-        const uploaded = this.vectors[name]?.uploaded;
-        if (uploaded != null) inputs[name] = { href: uploaded.href };
+      for (const name of INPUTS) {
+        const links = this.chosen[name].files.map(({ uploaded }) => ({ href: uploaded?.href }));
+        if (links.length > 0) inputs[name] = name === "tiles" ? links : links[0];
       }
       const response = await sendJson("POST", `processes/${process}/execution`, { inputs });
       const { jobID } = (await response.json()) as { jobID: string };
@@ -171,14 +162,9 @@ export class Submission {
   }
 
   private clear(): void {
-    this.tiles = [];
-    for (const name of VECTORS) {
-      this.vectors[name] = null;
-      this.vectorRows[name].replaceChildren();
-    }
+    for (const chosen of Object.values(this.chosen)) chosen.clear();
     this.options.clear();
     this.placeRefused = false;
-    this.rows.replaceChildren();
   }
 
   private fail(problem: Problem): void {
@@ -188,14 +174,15 @@ export class Submission {
 
   /** Make the button say what is missing. */
   private draw(): void {
-    const { footprints, guides } = this.vectors;
-    const files = [...this.tiles, footprints, guides].filter((sent) => sent !== null);
-    const isFar = this.tiles.some(({ preflight }) => typeof preflight["outsideAreaOfUse"] === "string");
-    this.options.draw(isFar || this.placeRefused, footprints === null ? null : texts(footprints.preflight["layers"]));
+    const files = Object.values(this.chosen).flatMap((chosen) => chosen.files);
+    const { tiles, footprints } = this.chosen;
+    const isFar = tiles.files.some(({ preflight }) => typeof preflight["outsideAreaOfUse"] === "string");
+    const [outlines] = footprints.files;
+    this.options.draw(isFar || this.placeRefused, outlines === undefined ? null : texts(outlines.preflight["layers"]));
     const missing = this.missing(files, isFar);
     const { variants } = this.options;
     // not `disabled`: the button keeps its place in the tab order and its name says why it waits
-    this.go.setAttribute("aria-disabled", String(missing !== null || this.tiles.length === 0));
+    this.go.setAttribute("aria-disabled", String(missing !== null || tiles.files.length === 0));
     this.go.textContent = missing ?? (variants.length > 1 ? `Compare ${variants.length} methods` : "Reconstruct");
   }
 

@@ -2,15 +2,15 @@
 
 import { el } from "../page/elements";
 import { bytes } from "../words/numbers";
-import { fingerprint, forget, interrupted, keyOf } from "./interrupted";
+import { forget, interrupted, keyOf } from "./interrupted";
 import { fileHead } from "./sent_file";
 
 export class Unfinished {
   readonly element = el("ul", { class: "files", "aria-label": "Interrupted uploads" });
   /** Rows by the keys of their uploads. */
   private readonly rows = new Map<string, HTMLElement>();
-  /** The beginnings of the keys of chosen files. */
-  private readonly taken: string[] = [];
+  /** The keys of chosen files. */
+  private readonly taken = new Set<string>();
 
   constructor() {
     void this.offer();
@@ -18,18 +18,14 @@ export class Unfinished {
 
   /** A file was chosen: it does not wait any longer. */
   take(file: File): void {
-    this.taken.push(keyOf(fingerprint(file)));
-    for (const [key, row] of this.rows) if (this.isTaken(key)) row.remove();
-  }
-
-  private isTaken(key: string): boolean {
-    return this.taken.some((begin) => key.startsWith(begin));
+    this.taken.add(keyOf(file));
+    this.rows.get(keyOf(file))?.remove();
   }
 
   private async offer(): Promise<void> {
     for (const one of await interrupted()) {
       const { key, name, size, offset } = one;
-      if (this.isTaken(key)) continue;
+      if (this.taken.has(key)) continue;
       const remove = (): void => {
         row.remove();
         void forget(one);
