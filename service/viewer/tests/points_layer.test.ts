@@ -1,4 +1,4 @@
-import { Matrix4, PerspectiveCamera, Ray, Vector3 } from "three";
+import { Box3, Matrix4, PerspectiveCamera, Ray, Vector3 } from "three";
 import { expect, test } from "vitest";
 import { classNumber, type PointColouring } from "../src/points/points_colouring";
 import { NO_PLANE, NO_RESIDUAL } from "../src/points/points_glb";
@@ -8,21 +8,23 @@ import { glbOf } from "./point_files";
 
 const COUNT = 100;
 
+const boxAt = (x: number, length: number): Box3 =>
+  new Box3().setFromCenterAndSize(new Vector3(x, 0, 2), new Vector3(length, 10, 4));
+
 /** A row of nodes of 10 m below a root; their points lie in a line of steps of 1 cm, 2 m above the origin. */
 function row(length: number): Tile {
   const leaf = (n: number): Tile => ({
     points: `node ${n}`,
     tileset: null,
     inner: null,
-    centre: [10 * n + 5, 0, 2],
-    half: [5, 5, 2],
+    box: boxAt(10 * n + 5, 10),
     errorM: 0,
     count: COUNT,
     offset: [10 * n, 0, 0],
     children: [],
   });
   const children = Array.from({ length }, (_, n) => leaf(n));
-  return { ...leaf(0), points: null, count: 0, centre: [5 * length, 0, 2], half: [5 * length, 5, 2], errorM: 1000, offset: [0, 0, 0], children };
+  return { ...leaf(0), points: null, count: 0, box: boxAt(5 * length, 10 * length), errorM: 1000, offset: [0, 0, 0], children };
 }
 
 const FILE = glbOf(

@@ -1,3 +1,4 @@
+import { Box3, Vector3 } from "three";
 import { expect, test } from "vitest";
 import { selected, type View } from "../src/points/points_selection";
 import type { Tile, Xyz } from "../src/points/points_tileset";
@@ -11,8 +12,7 @@ function quadtree(size: number, depth: number, centre: Xyz = [0, 0, 0], name = "
     points: name,
     tileset: null,
     inner: null,
-    centre,
-    half: [size / 2, size / 2, 5],
+    box: new Box3().setFromCenterAndSize(new Vector3(...centre), new Vector3(size, size, 10)),
     errorM: depth === 0 ? 0 : size / 25,
     count: COUNT,
     offset: [0, 0, 0],
@@ -25,13 +25,13 @@ function quadtree(size: number, depth: number, centre: Xyz = [0, 0, 0], name = "
   };
 }
 
-const EVERYWHERE: View = { eye: [0, 0, 50], pixelsPerMetre: 1000, sees: () => true };
+const EVERYWHERE: View = { eye: new Vector3(0, 0, 50), pixelsPerMetre: 1000, sees: () => true };
 const FREE = { errorPx: 8, points: Infinity };
 
 const names = (root: Tile, view: View, limits = FREE) => selected(root, view, limits).tiles.map(({ points }) => points as string);
 
 test("a node is drawn only with all nodes above it, which come first", () => {
-  const drawn = names(quadtree(1000, 5), { ...EVERYWHERE, eye: [200, 130, 40] });
+  const drawn = names(quadtree(1000, 5), { ...EVERYWHERE, eye: new Vector3(200, 130, 40) });
   const before = new Set<string>();
   for (const name of drawn) {
     if (name !== "r") expect(before).toContain(name.slice(0, -1));
@@ -41,7 +41,7 @@ test("a node is drawn only with all nodes above it, which come first", () => {
 });
 
 test("near nodes are finer than far ones", () => {
-  const drawn = names(quadtree(4000, 6), { ...EVERYWHERE, eye: [1990, 1990, 30] });
+  const drawn = names(quadtree(4000, 6), { ...EVERYWHERE, eye: new Vector3(1990, 1990, 30) });
   const depth = (corner: string) => Math.max(...drawn.filter((name) => name.startsWith(`r${corner}`)).map((name) => name.length));
   expect(depth("3")).toBeGreaterThan(depth("0") + 1);
 });
@@ -57,20 +57,20 @@ test("the budget is kept, and what it cuts off is the least wanted", () => {
 test("a hundred times as many points do not make the selection larger than the budget", () => {
   const limits = { ...FREE, points: 50 * COUNT };
   for (const depth of [4, 7]) {
-    const { tiles } = selected(quadtree(8000, depth), { ...EVERYWHERE, eye: [0, 0, 10] }, limits);
+    const { tiles } = selected(quadtree(8000, depth), { ...EVERYWHERE, eye: new Vector3(0, 0, 10) }, limits);
     expect(tiles.reduce((sum, { count }) => sum + count, 0)).toBeLessThanOrEqual(limits.points);
   }
 });
 
 test("a view with more pixels wants more nodes, one from farther away fewer", () => {
   const root = quadtree(1000, 5);
-  const usual = names(root, { ...EVERYWHERE, eye: [0, 0, 800] }).length;
-  expect(names(root, { ...EVERYWHERE, eye: [0, 0, 800], pixelsPerMetre: 3000 }).length).toBeGreaterThan(usual);
-  expect(names(root, { ...EVERYWHERE, eye: [0, 0, 8000] }).length).toBeLessThan(usual);
+  const usual = names(root, { ...EVERYWHERE, eye: new Vector3(0, 0, 800) }).length;
+  expect(names(root, { ...EVERYWHERE, eye: new Vector3(0, 0, 800), pixelsPerMetre: 3000 }).length).toBeGreaterThan(usual);
+  expect(names(root, { ...EVERYWHERE, eye: new Vector3(0, 0, 8000) }).length).toBeLessThan(usual);
 });
 
 test("what is out of the view is not drawn, nor anything below it", () => {
-  const west = names(quadtree(1000, 4), { ...EVERYWHERE, sees: (centre, half) => centre[0] - half[0] < 0 });
+  const west = names(quadtree(1000, 4), { ...EVERYWHERE, sees: (box) => box.min.x < 0 });
   expect(west.some((name) => name.startsWith("r0"))).toBe(true);
   expect(west.every((name) => name === "r" || name.startsWith("r0") || name.startsWith("r2"))).toBe(true);
 });
@@ -81,11 +81,11 @@ test("a tileset that is not read yet is asked for when it would be drawn", () =>
   const { tiles, unread } = selected(root, EVERYWHERE, FREE);
   expect(tiles).toEqual([]);
   expect(unread.map(({ tileset }) => tileset)).toEqual(["r0.json", "r1.json", "r2.json", "r3.json"]);
-  expect(selected(root, { ...EVERYWHERE, eye: [0, 0, 1e6] }, FREE).unread).toEqual([]);
+  expect(selected(root, { ...EVERYWHERE, eye: new Vector3(0, 0, 1e6) }, FREE).unread).toEqual([]);
 });
 
 test("the root of a tileset that was read is drawn wherever the node is that holds it", () => {
   const root = { ...quadtree(1000, 0), points: null, count: 0, inner: quadtree(1000, 3) };
-  expect(names(root, { ...EVERYWHERE, eye: [0, 0, 1e6] })).toEqual(["r"]);
+  expect(names(root, { ...EVERYWHERE, eye: new Vector3(0, 0, 1e6) })).toEqual(["r"]);
   expect(names(root, EVERYWHERE)).toEqual(names(quadtree(1000, 3), EVERYWHERE));
 });

@@ -1,3 +1,4 @@
+import { Vector3 } from "three";
 import { expect, test } from "vitest";
 import { factsOf, rootOf, type RawTileset } from "../src/points/points_tileset";
 
@@ -32,9 +33,9 @@ test("content is found beside its tileset, and an inner tileset is known as one"
 
 test("translations add up, in boxes and for the content", () => {
   const [inner] = rootOf(OUTER, ADDRESS).children;
-  expect([inner.offset, inner.centre, inner.half]).toEqual([[100, 0, 2], [110, 20, 7], [10, 20, 5]]);
+  expect([inner.offset, ...inner.box.min, ...inner.box.max]).toEqual([[100, 0, 2], 100, 0, 2, 120, 40, 12]);
   const below = rootOf({ asset: { version: "1.1" }, root: { ...OUTER.root, transform: shift(1, 1, 1), children: [] } }, inner.tileset ?? "", inner.offset);
-  expect([below.offset, below.centre]).toEqual([[101, 1, 3], [111, 21, 8]]);
+  expect([below.offset, below.box.getCenter(new Vector3()).toArray()]).toEqual([[101, 1, 3], [111, 21, 8]]);
   expect(below.points).toBe("https://service.example/jobs/1/points/x1_y1/upper/0.glb");
 });
 

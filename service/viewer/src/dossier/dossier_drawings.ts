@@ -1,7 +1,7 @@
 /** The drawings of a dossier as SVG: plan, section across the ridge, residuals. Lengths are metres, without exaggeration. */
 
 import { CYCLE } from "../models/colouring";
-import { boxAround, type Point } from "../models/plan";
+import { boxAround, pathOf, type Point } from "../models/plan";
 import { svg } from "../page/elements";
 import { NONE, residualNumber, RESIDUALS } from "../points/points_colouring";
 import { count, measure } from "../words/numbers";
@@ -118,9 +118,7 @@ export function planDrawing(
   const low: Point = [west - 1, south - 1];
   const high: Point = [east + 1, north + 1];
   const frame = frameOf(low, high);
-  const path = outline
-    .map((ring) => `M${ring.map(([x, y]) => `${frame.x(x).toFixed(1)} ${frame.y(y).toFixed(1)}`).join("L")}Z`)
-    .join("");
+  const path = pathOf(outline, ([x, y]) => [frame.x(x), frame.y(y)]);
   const children: SVGElement[] = [svg("path", { class: "outline-fill", d: path, "fill-rule": "evenodd" })];
   if (points !== null) children.push(dots(thinned(points, frame, colouring), dotRadius(points.xyz.length / 3)));
   const order: EdgeKind[] = ["eave", "step", "hip", "valley", "ridge"];

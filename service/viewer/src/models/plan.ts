@@ -17,6 +17,12 @@ export function polygonsOf(geometry: Feature["geometry"] | undefined): Point[][]
 /** The outer rings and holes of a footprint. */
 export const ringsOf = (geometry: Feature["geometry"]): Point[][] => polygonsOf(geometry).flat();
 
+/** Rings as the path of an SVG; `place` is where a point is drawn. */
+export function pathOf(rings: readonly (readonly Point[])[], place: (point: Point) => Point, digits = 1): string {
+  const words = (point: Point): string => place(point).map((value) => value.toFixed(digits)).join(" ");
+  return rings.map((ring) => `M${ring.map(words).join("L")}Z`).join("");
+}
+
 /** Area of a ring, closed or not; negative for one that runs clockwise. */
 export function areaOf(ring: readonly Point[]): number {
   // relative to the first place: far from the origin the products would lose the digits that matter

@@ -20,7 +20,11 @@ export function el<K extends keyof HTMLElementTagNameMap>(
 }
 
 /** The same for SVG. */
-export function svg(tag: string, properties: Properties = {}, ...children: Child[]): SVGElement {
+export function svg<K extends keyof SVGElementTagNameMap>(
+  tag: K,
+  properties: Properties = {},
+  ...children: Child[]
+): SVGElementTagNameMap[K] {
   const element = document.createElementNS("http://www.w3.org/2000/svg", tag);
   setProperties(element, properties);
   element.append(...present(children));

@@ -49,7 +49,6 @@ export class PointsLayer implements Layer {
   private readonly loading = new Map<Tile, AbortController>();
   private readonly faulty = new Set<Tile>();
   private readonly frustum = new Frustum();
-  private readonly box = new Box3();
   private frame = 0;
 
   /**
@@ -76,12 +75,8 @@ export class PointsLayer implements Layer {
     this.frustum.setFromProjectionMatrix(
       new Matrix4().multiplyMatrices(camera.projectionMatrix, camera.matrixWorldInverse).multiply(this.object.matrixWorld),
     );
-    const eye = this.object.worldToLocal(camera.position.clone()).toArray();
-    const sees = (centre: Xyz, half: Xyz): boolean => {
-      this.box.min.set(centre[0] - half[0], centre[1] - half[1], centre[2] - half[2]);
-      this.box.max.set(centre[0] + half[0], centre[1] + half[1], centre[2] + half[2]);
-      return this.frustum.intersectsBox(this.box);
-    };
+    const eye = this.object.worldToLocal(camera.position.clone());
+    const sees = (box: Box3): boolean => this.frustum.intersectsBox(box);
     const ratio = devicePixelRatio;
     const wanted = selected(this.root, { eye, pixelsPerMetre: pixelsPerMetre / ratio, sees }, { errorPx: ERROR_PX, points: this.budget });
     this.material.uniforms["pixelsPerMetre"].value = pixelsPerMetre;
@@ -100,10 +95,7 @@ export class PointsLayer implements Layer {
     for (const [tile, { points, drawn }] of this.loaded) {
       const { places, labels } = points;
       if (!drawn.visible) continue;
-      const { centre, half } = tile;
-      box.min.set(centre[0] - half[0], centre[1] - half[1], centre[2] - half[2]).add(this.object.position);
-      box.max.set(centre[0] + half[0], centre[1] + half[1], centre[2] + half[2]).add(this.object.position);
-      box.expandByScalar(Math.min(reach * farthest, 1));
+      box.copy(tile.box).translate(this.object.position).expandByScalar(Math.min(reach * farthest, 1));
       if (!ray.intersectsBox(box)) continue;
       // in steps of the node, which are alike in all directions
       const local = ray.clone().applyMatrix4(inverse.copy(drawn.matrixWorld).invert());

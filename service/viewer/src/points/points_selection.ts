@@ -1,13 +1,14 @@
 /** Which nodes of the octree are drawn from a place: by screen-space error, within a budget of points. */
 
-import type { Tile, Xyz } from "./points_tileset";
+import type { Box3, Vector3 } from "three";
+import type { Tile } from "./points_tileset";
 
 export interface View {
-  eye: Xyz;
+  eye: Vector3;
   /** Pixels of a metre at a distance of one metre. */
   pixelsPerMetre: number;
   /** Whether any part of a box is in the view. */
-  sees: (centre: Xyz, half: Xyz) => boolean;
+  sees: (box: Box3) => boolean;
 }
 
 export interface Limits {
@@ -33,8 +34,8 @@ const NEAREST_M = 0.1;
 export function selected(root: Tile, view: View, limits: Limits): Selection {
   const wanted: { tile: Tile; errorPx: number }[] = [];
   const visit = (tile: Tile, parentErrorM: number): void => {
-    if (!view.sees(tile.centre, tile.half)) return;
-    const scale = view.pixelsPerMetre / Math.max(distance(view.eye, tile), NEAREST_M);
+    if (!view.sees(tile.box)) return;
+    const scale = view.pixelsPerMetre / Math.max(tile.box.distanceToPoint(view.eye), NEAREST_M);
     wanted.push({ tile, errorPx: parentErrorM * scale });
     if (tile.inner !== null) visit(tile.inner, parentErrorM);
     if (tile.errorM * scale <= limits.errorPx) return;
@@ -51,9 +52,4 @@ export function selected(root: Tile, view: View, limits: Limits): Selection {
     if (tile.points !== null) chosen.tiles.push(tile);
   }
   return chosen;
-}
-
-/** Distance from a place to a node's box, 0 within it. */
-function distance(eye: Xyz, { centre, half }: Tile): number {
-  return Math.hypot(...[0, 1, 2].map((axis) => Math.max(Math.abs(eye[axis] - centre[axis]) - half[axis], 0)));
 }

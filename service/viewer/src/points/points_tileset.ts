@@ -1,5 +1,7 @@
 /** The octree of the points: tilesets of 3D Tiles 1.1 with `refine: ADD`, as far as a run writes them. */
 
+import { Box3, Vector3 } from "three";
+
 export type Xyz = readonly [number, number, number];
 
 /** A node of the octree, in metres in the frame of the root tileset: x east, y north, z up. */
@@ -10,9 +12,7 @@ export interface Tile {
   tileset: string | null;
   /** The root of that tileset once it has been read: drawn wherever this node is. */
   inner: Tile | null;
-  centre: Xyz;
-  /** Half the size of its box. */
-  half: Xyz;
+  box: Box3;
   /** What is missing if its children are not drawn; 0 for leaves. */
   errorM: number;
   /** Number of its own points; 0 if unknown. */
@@ -73,6 +73,10 @@ function tileOf(raw: RawTile, address: string, outer: Xyz, refine: string): Tile
   const offset = moved(outer, raw.transform);
   const box = raw.boundingVolume?.box;
   if (box?.length !== 12) throw new Error("a tile of the tileset has no box");
+  const centre = new Vector3(...offset).add(new Vector3().fromArray(box));
+  // the box's three half axes, whatever their directions
+  const [x, y, z] = [0, 1, 2].map((axis) => Math.abs(box[3 + axis]) + Math.abs(box[6 + axis]) + Math.abs(box[9 + axis]));
+  const size = new Vector3(x, y, z).multiplyScalar(2);
   const uri = raw.content?.uri;
   const content = uri === undefined ? null : new URL(uri, address).href;
   const isTileset = content !== null && new URL(content).pathname.endsWith(".json");
@@ -80,9 +84,7 @@ function tileOf(raw: RawTile, address: string, outer: Xyz, refine: string): Tile
     points: isTileset ? null : content,
     tileset: isTileset ? content : null,
     inner: null,
-    centre: [box[0] + offset[0], box[1] + offset[1], box[2] + offset[2]],
-    // of the three half axes, whatever their directions
-    half: [0, 1, 2].map((axis) => Math.abs(box[3 + axis]) + Math.abs(box[6 + axis]) + Math.abs(box[9 + axis])) as unknown as Xyz,
+    box: new Box3().setFromCenterAndSize(centre, size),
     errorM: raw.geometricError ?? 0,
     count: isTileset ? 0 : (raw.extras?.points ?? 0),
     offset,

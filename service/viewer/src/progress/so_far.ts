@@ -1,7 +1,7 @@
 import { waited } from "../api/event_stream";
 import { getJson } from "../api/requests";
 import type { Feature } from "../api/types";
-import { boxAround, ringsOf, united, type Box, type Point } from "../models/plan";
+import { pathOf, ringsOf, type Point } from "../models/plan";
 import { el, svg } from "../page/elements";
 import { counted } from "../words/numbers";
 import { CATEGORIES, categoryOf } from "../words/roof_types";
@@ -13,16 +13,8 @@ const MARGIN = 0.03; // of the longer side
 
 interface Page {
   complete: boolean;
-  numberMatched: number;
   attempt?: number;
   features: Feature[];
-}
-
-/** Rings as the path of an SVG, from an origin, with north up. */
-export function pathOf(rings: Point[][], [x0, y0]: Point): string {
-  return rings
-    .map((ring) => `M${ring.map(([x, y]) => `${(x - x0).toFixed(2)} ${(y0 - y).toFixed(2)}`).join("L")}Z`)
-    .join("");
 }
 
 /** The outlines of a running job's buildings, seen from above, as they are modelled. */
@@ -32,9 +24,7 @@ export class BuildingsSoFar {
   readonly element = el("figure", { class: "so-far", hidden: true }, this.plan, this.words);
   private attempt = 0;
   private known = 0;
-  private drawn = 0;
   private origin: Point | null = null;
-  private bounds: Box = boxAround([]);
   private begun = false;
 
   constructor(
@@ -72,9 +62,8 @@ export class BuildingsSoFar {
 
   private clear(attempt: number): void {
     this.attempt = attempt;
-    this.known = this.drawn = 0;
+    this.known = 0;
     this.origin = null;
-    this.bounds = boxAround([]);
     this.plan.replaceChildren();
   }
 
@@ -83,21 +72,18 @@ export class BuildingsSoFar {
     this.known += page.features.length;
     this.element.hidden = this.known === 0;
     this.words.textContent = `${counted(this.known, "building")} so far`;
-    if (this.origin === null) return;
-    const [west, south, east, north] = this.bounds;
-    const margin = MARGIN * Math.max(east - west, north - south);
-    const corner = [west - this.origin[0] - margin, this.origin[1] - north - margin];
-    this.plan.setAttribute("viewBox", [...corner, east - west + 2 * margin, north - south + 2 * margin].join(" "));
+    const { x, y, width, height } = this.plan.getBBox();
+    const margin = MARGIN * Math.max(width, height);
+    this.plan.setAttribute("viewBox", [x - margin, y - margin, width + 2 * margin, height + 2 * margin].join(" "));
   }
 
   private draw({ geometry, properties }: Feature): void {
     const rings = ringsOf(geometry);
     const first = rings[0]?.[0];
-    if (first === undefined || this.drawn >= MOST_DRAWN) return;
-    this.drawn += 1;
-    this.origin ??= first;
-    this.bounds = united([this.bounds, boxAround(rings.flat())]);
+    if (first === undefined || this.plan.childElementCount >= MOST_DRAWN) return;
+    const [x0, y0] = (this.origin ??= first);
+    const d = pathOf(rings, ([x, y]) => [x - x0, y0 - y], 2); // north up
     const { colour } = CATEGORIES[categoryOf(properties["status"], properties["roof_type"])];
-    this.plan.append(svg("path", { d: pathOf(rings, this.origin), fill: colour, "fill-rule": "evenodd" }));
+    this.plan.append(svg("path", { d, fill: colour, "fill-rule": "evenodd" }));
   }
 }
