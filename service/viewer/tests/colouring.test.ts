@@ -1,5 +1,5 @@
 import { expect, test } from "vitest";
-import { Batcher, type Batch } from "../src/models/batching";
+import { Batcher, type Batch, type Gathered } from "../src/models/batching";
 import { SURFACE } from "../src/models/building_mesh";
 import { SequenceReader, type Building } from "../src/models/cityjson";
 import { classesOf, coloursOf, CYCLE, outlineColour, type Colouring } from "../src/models/colouring";
@@ -20,10 +20,10 @@ const HOUSES = [
   house("c", { share_within_0_2m: null, rmse_m: 0.04, status: "fallback", reason: "crashed" }),
 ];
 
-function batched(): { batches: Batch[]; listed: ReturnType<Batcher["add"]>[] } {
+function batched(): Gathered {
   const batcher = new Batcher({ origin: [565005, 5934003, 90], horizontalUnitM: 1, verticalUnitM: 1 });
-  const listed = HOUSES.map((building) => batcher.add(building));
-  return { batches: batcher.take(), listed };
+  for (const building of HOUSES) batcher.add(building);
+  return batcher.take();
 }
 
 /** sRGB bytes to the bytes of linear light that the models have. */

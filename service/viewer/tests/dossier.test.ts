@@ -152,14 +152,14 @@ test("a dossier says what to rely on and what not, in sentences", () => {
   expect(said.bad[0]).toMatch(/^14\.0\u202fm² of the roof have no point near them/);
   expect(said.bad.join(" ")).toMatch(/curved.*12\u202f% of the plan were made level/);
   expect(trust({ status: "failed", reason: "no_plane" }, []).bad).toEqual(["There is no model: no roof plane was found in its points."]);
-  expect(trustFigures({ bic_margin: 12 }).map(({ label }) => label)).toEqual(["Lead over the next form"]);
+  expect(trustFigures({ bic_margin: 12 }).map(({ row }) => row["Figure"])).toEqual(["Lead over the next form"]);
 });
 
 test("the figures of fit name the points that they are of: older runs did not leave out facades", () => {
   const figures = { share_within_0_2m: 0.97, rmse_m: 0.04 };
-  expect(trustFigures(figures).map(({ label }) => label)).toEqual(["Points within 0.2 m of the roof", "RMSE of the points"]);
+  expect(trustFigures(figures).map(({ row }) => row["Figure"])).toEqual(["Points within 0.2 m of the roof", "RMSE of the points"]);
   const now = { ...figures, share_below_roof: 0.3 };
-  expect(trustFigures(now).map(({ label }) => label)).toEqual(["Roof returns within 0.2 m of the roof", "RMSE of the roof returns"]);
+  expect(trustFigures(now).map(({ row }) => row["Figure"])).toEqual(["Roof returns within 0.2 m of the roof", "RMSE of the roof returns"]);
   expect(trust({ ...now, status: "ok" }, []).good[0]).toBe("97\u202f% of the roof returns lie within 0.2 m of the roof.");
   expect(withinWords(0.68, now)).toBe(
     "68\u202f% of all lie within 0.2 m; without the 30\u202f% on facades and below the roof, 97\u202f%",
@@ -169,14 +169,16 @@ test("the figures of fit name the points that they are of: older runs did not le
 });
 
 test("figures are shown beside their limits, forms with their outcome", () => {
-  expect(checkRows(DECISIONS)).toEqual([{ label: "Roof points", value: "412 points", limit: "from 10 points", words: "enough for a model" }]);
+  expect(checkRows(DECISIONS)).toEqual([
+    { Figure: "Roof points", Value: "412 points", Limit: "from 10 points", Meaning: "enough for a model" },
+  ]);
   const rows = formRows(DECISIONS, { rmse_m: 0.053 });
-  expect(rows.map(({ cells }) => [cells["Form"], cells["Outcome"]])).toEqual([
+  expect(rows.map((row) => [row["Form"], row["Outcome"]])).toEqual([
     ["Arrangement of the planes' lines", "not a valid solid"],
     ["Traced faces", "chosen"],
     ["LoD1.2", "made"],
   ]);
-  expect([rows[0].cells["Notes"], rows[0].cells["RMSE"], rows[1].cells["RMSE"]]).toEqual(["codes 306", "–", "0.053\u202fm"]);
+  expect([rows[0]["Notes"], rows[0]["RMSE"], rows[1]["RMSE"]]).toEqual(["codes 306", "–", "0.053\u202fm"]);
 });
 
 test("a doubtful model says why, with the figure and the threshold, and which side of the limit is right", () => {
@@ -188,7 +190,7 @@ test("a doubtful model says why, with the figure and the threshold, and which si
     { step: 0, kind: "check", name: "scatter_m", outcome: "missed", detail: "", value: 0.32, limit: 0.15 },
     { step: 1, kind: "check", name: "share_on_roof", outcome: "missed", detail: "", value: 0.45, limit: 0.7 },
   ];
-  expect(checkRows(checks).map(({ limit }) => limit)).toEqual(["up to 0.15\u202fm", "from 70\u202f%"]);
+  expect(checkRows(checks).map((row) => row["Limit"])).toEqual(["up to 0.15\u202fm", "from 70\u202f%"]);
 });
 
 test("a dossier has an address of its own, which keeps the query", () => {

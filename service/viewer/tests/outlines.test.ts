@@ -21,11 +21,11 @@ describe("outlines", () => {
     if (house === null) throw new Error("no building was read");
     const batcher = new Batcher(FRAME);
     batcher.add(house);
-    const outlines = batcher.takeOutlines();
+    const { outlines } = batcher.take();
     expect(outlines.map(({ id, category, rings }) => [id, category, rings.length])).toEqual([["house", "gable", 1]]);
     expect(outlines[0].rings[0]).toHaveLength(8);
     expect(areaOf(outlines[0].rings[0])).toBeCloseTo(60, 3);
-    expect(batcher.takeOutlines()).toEqual([]);
+    expect(batcher.take()).toEqual({ batches: [], listed: [], outlines: [] });
   });
 
   it("of an object without a model are its polygon, whose holes run clockwise", () => {

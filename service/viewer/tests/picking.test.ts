@@ -15,7 +15,7 @@ function houses(count: number): Batch[] {
     house.vertices = house.vertices.map((value, at) => (at % 3 === 0 ? value + 20 * i : value));
     batcher.add({ ...house, id: `house ${i}` });
   }
-  return batcher.take();
+  return batcher.take().batches;
 }
 
 type Xyz = [number, number, number];

@@ -3,7 +3,7 @@
 import { getJson, pathOfJob } from "../api/requests";
 import type { StatusInfo } from "../api/types";
 import { titleOf, whenWords } from "../jobs/job_words";
-import type { Batch, Listed } from "../models/batching";
+import type { Batch, Gathered, Listed } from "../models/batching";
 import { originInMetres } from "../models/building_mesh";
 import { CHANGES, LIMITS, pairs, type Change, type Pair, type Placed } from "../models/pairing";
 import { RunObjects } from "../models/run_objects";
@@ -310,7 +310,7 @@ async function read({ job, method }: Side, signal: AbortSignal): Promise<Loaded>
   const objects = new RunObjects(pathOfJob(job), method);
   await objects.readReport(signal);
   const batches: Batch[] = [];
-  const take = (read: { listed: Listed[]; batches: Batch[] }): void => {
+  const take = (read: Gathered): void => {
     objects.add(read.listed);
     batches.push(...read.batches);
   };

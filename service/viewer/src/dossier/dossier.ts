@@ -10,8 +10,9 @@ import { COLUMNS, shown } from "../models/columns";
 import { flatOutlines } from "../models/failed_footprints";
 import { ringsOf } from "../models/plan";
 import { elevationUnitM, inMetres, modelUnits } from "../models/units";
-import { button, el, svg } from "../page/elements";
+import { button, el, svg, type Properties } from "../page/elements";
 import { report } from "../page/notices";
+import { bareTable } from "../page/tables";
 import { RESIDUALS } from "../points/points_colouring";
 import { capital } from "../words/fields";
 import { count, counted, measure } from "../words/numbers";
@@ -19,7 +20,7 @@ import { CATEGORIES, categoryOf } from "../words/roof_types";
 import { histogramDrawing, planDrawing, planeColour, sectionDrawing, type Colouring, type Rings } from "./dossier_drawings";
 import { histogram, modelOf, pointsIn, roofEdges, sectionOf, strip, stripWidth, type Points } from "./dossier_geometry";
 import type { DossierScene } from "./dossier_scene";
-import { checkRows, formRows, trust, trustFigures, withinWords } from "./dossier_words";
+import { checkRows, CHOSEN, formRows, trust, trustFigures, withinWords, type Row } from "./dossier_words";
 import "./dossier.css";
 
 interface Loaded {
@@ -118,7 +119,7 @@ function batchesOf(feature: Feature, building: Building, frame: SceneFrame): Bat
   if (building.faces.length === 0) return flatOutlines([feature], "failed", frame, () => 0).batches;
   const batcher = new Batcher(frame);
   batcher.add(building);
-  return batcher.take();
+  return batcher.take().batches;
 }
 
 /** The points of a building; null for one whose process ended before they were assigned to it. */
@@ -170,8 +171,12 @@ function draw(body: HTMLElement, loaded: Loaded): () => void {
       space,
       points === null ? null : figure("Residuals", residualWords(points, properties), el("div", { class: "dossier-drawing" }, histogramDrawing(points.residuals))),
     ),
-    figuresTable(properties, decisions ?? []),
-    formsTable(properties, decisions),
+    table("The figures that decided", [...checkRows(decisions ?? []), ...trustFigures(properties).map(({ row }) => row)]),
+    table(
+      "The forms that were tried",
+      formRows(decisions ?? [], properties),
+      decisions === null ? "This job was made by a version that recorded none." : "None was tried.",
+    ),
   );
   paint(colouring);
   if (space !== null) {
@@ -252,38 +257,12 @@ function verdict(properties: Feature["properties"], decisions: Decision[]): HTML
   return el("div", { class: "dossier-verdict" }, list("trusted", "You can rely on", good), list("doubted", "Look twice at", bad));
 }
 
-function table(caption: string, heads: string[], rows: (string | Node)[][], marked: (row: number) => string | null = () => null): HTMLElement {
-  return el(
-    "section",
-    { class: "dossier-table" },
-    el("h2", {}, caption),
-    el(
-      "div",
-      { class: "dossier-scroll", tabindex: 0, role: "region", "aria-label": caption },
-      el(
-        "table",
-        {},
-        el("thead", {}, el("tr", {}, ...heads.map((head) => el("th", { scope: "col" }, head)))),
-        el("tbody", {}, ...rows.map((cells, i) => el("tr", { class: marked(i) }, ...cells.map((cell) => el("td", {}, cell))))),
-      ),
-    ),
-  );
-}
-
-function figuresTable(properties: Feature["properties"], decisions: Decision[]): HTMLElement {
-  const checks = checkRows(decisions).map(({ label, value, limit, words }) => [label, value, limit, words]);
-  const figures = trustFigures(properties).map(({ label, value, limit, good }) => [label, value, limit, good ? "good" : "look twice"]);
-  return table("The figures that decided", ["Figure", "Value", "Limit", "Meaning"], [...checks, ...figures]);
-}
-
-function formsTable(properties: Feature["properties"], decisions: Decision[] | null): HTMLElement {
-  const caption = "The forms that were tried";
-  const rows = formRows(decisions ?? [], properties);
-  if (rows.length === 0) {
-    const words = decisions === null ? "This job was made by a version that recorded none." : "None was tried.";
-    return el("section", {}, el("h2", {}, caption), el("p", { class: "hint" }, words));
-  }
-  const filled = Object.keys(rows[0].cells).filter((head) => rows.some(({ cells }) => !["", "–"].includes(cells[head])));
-  const cells = rows.map((row) => filled.map((head) => row.cells[head]));
-  return table(caption, filled, cells, (i) => (rows[i].chosen ? "dossier-chosen" : null));
+/** Rows of a table, without the columns that say nothing. */
+function table(caption: string, rows: readonly Row[], nothing = ""): HTMLElement {
+  const heads = Object.keys(rows[0] ?? {}).filter((head) => rows.some((row) => !["", "–"].includes(row[head])));
+  const columns = heads.map((head) => ({ head, cell: (row: Row) => row[head] }));
+  const region = { class: "dossier-scroll", tabindex: 0, role: "region", "aria-label": caption };
+  const isChosen = (row: Row): Properties => ({ class: CHOSEN.includes(row["Outcome"]) ? "dossier-chosen" : null });
+  const content = rows.length > 0 ? el("div", region, bareTable({}, columns, rows, isChosen)) : el("p", { class: "hint" }, nothing);
+  return el("section", { class: "dossier-table" }, el("h2", {}, caption), content);
 }

@@ -1,20 +1,25 @@
 /** The sentences of a dossier: what of a model deserves trust, which figures decided, which forms were tried. */
 
 import type { Decision, Feature } from "../api/types";
+import { COLUMNS, shown } from "../models/columns";
 import { capital, reasonWords } from "../words/fields";
 import { counted, measure } from "../words/numbers";
 
 type Properties = Feature["properties"];
 
-/** A figure beside its limit. */
+/** A row of a table: its texts by the heads of the columns. */
+export type Row = Record<string, string>;
+
+/** A figure that says how far the model can be trusted. */
 export interface Figure {
-  label: string;
-  value: string;
-  limit: string;
-  good: boolean;
+  row: Row;
+  isGood: boolean;
   /** What it means, in a sentence. */
   words: string;
 }
+
+type Limit = { least: number } | { most: number };
+type Sentence = (figure: string) => string;
 
 const number = (value: unknown): number | null => (typeof value === "number" && Number.isFinite(value) ? value : null);
 const percent = (value: number): string => measure(100 * value, 0, "%");
@@ -35,55 +40,42 @@ const LEAD = "Lead over the next form";
 /** The figures that say how far the model can be trusted, those that are known. */
 export function trustFigures(properties: Properties): Figure[] {
   const figures: Figure[] = [];
-  const add = (
-    column: string,
-    label: string,
-    show: (value: number) => string,
-    limit: number,
-    least: boolean,
-    good: (shown: string) => string,
-    bad: (shown: string) => string,
-  ): void => {
+  const add = (column: string, label: string, limit: Limit, good: Sentence, bad: Sentence): void => {
     const value = number(properties[column]);
     if (value === null) return;
-    const met = least ? value >= limit : value <= limit;
-    const shown = show(value);
-    figures.push({
-      label,
-      value: shown,
-      limit: `${least ? "at least" : "at most"} ${show(limit)}`,
-      good: met,
-      words: met ? good(shown) : bad(shown),
-    });
+    const digits = COLUMNS[column]?.unit === "%" ? 0 : undefined;
+    const show = (one: number): string => (column in COLUMNS ? shown(column, one, 1, digits) : measure(one, 1));
+    const isGood = "least" in limit ? value >= limit.least : value <= limit.most;
+    const words = "least" in limit ? `at least ${show(limit.least)}` : `at most ${show(limit.most)}`;
+    const row = { Figure: label, Value: show(value), Limit: words, Meaning: isGood ? "good" : "look twice" };
+    figures.push({ row, isGood, words: (isGood ? good : bad)(show(value)) });
   };
-  const metres = (digits: number) => (value: number) => measure(value, digits, "m");
-  const squares = (value: number): string => measure(value, 1, "m²");
   const area = number(properties["footprint_area_m2"]) ?? 0;
   const judged = judgedPoints(properties);
-  add("share_within_0_2m", `${capital(judged)} within 0.2 m of the roof`, percent, WITHIN_SHARE, true,
-    (shown) => `${shown} of the ${judged} lie within 0.2 m of the roof.`,
-    (shown) => `Only ${shown} of the ${judged} lie within 0.2 m of the roof: its form is not the measured one everywhere.`);
-  add("rmse_m", `RMSE of the ${judged}`, metres(3), RMSE_M, false,
-    (shown) => `The ${judged} differ from the roof by ${shown} (RMSE).`,
-    (shown) => `The ${judged} differ from the roof by ${shown} (RMSE): dormers, chimneys or trees are not modelled.`);
-  add("unexplained_m2", "Roof without a point near it", squares, Math.max(2, UNEXPLAINED_SHARE * area), false,
-    (shown) => (shown.startsWith("0.0") ? "Points lie on all of the roof." : `Points lie on nearly all of the roof; ${shown} have none.`),
-    (shown) => `${shown} of the roof have no point near them: the form there is assumed.`);
-  add("largest_hole_m", "Largest hole in the points", metres(1), HOLE_M, false,
-    (shown) => `The largest hole in the points is ${shown} wide.`,
-    (shown) => `The points have a hole ${shown} wide: what is there was not measured.`);
-  add("ridge_z_sigma_m", "Uncertainty of the ridge's height", metres(3), RIDGE_SIGMA_M, false,
-    (shown) => `The height of the ridge is known to ${shown} (one sigma).`,
-    (shown) => `The height of the ridge is known to ${shown} only (one sigma).`);
-  add("bic_margin", LEAD, (value) => measure(value, 1), BIC_MARGIN, true,
-    (shown) => `No other form that was tried explains the points as well (lead ${shown}).`,
-    (shown) => `Another form explains the points almost as well (lead ${shown}): the roof's form is uncertain.`);
-  add("detection_confidence", "Confidence that it is a building", percent, CONFIDENCE, true,
-    (shown) => `It is a building with a confidence of ${shown}.`,
-    (shown) => `It may not be a building: the confidence is ${shown}.`);
-  add("footprint_share", "Given footprint covered", percent, FOOTPRINT_SHARE, true,
-    (shown) => `The model fills ${shown} of the given footprint.`,
-    (shown) => `The model fills only ${shown} of the given footprint: the rest has no points.`);
+  add("share_within_0_2m", `${capital(judged)} within 0.2 m of the roof`, { least: WITHIN_SHARE },
+    (figure) => `${figure} of the ${judged} lie within 0.2 m of the roof.`,
+    (figure) => `Only ${figure} of the ${judged} lie within 0.2 m of the roof: its form is not the measured one everywhere.`);
+  add("rmse_m", `RMSE of the ${judged}`, { most: RMSE_M },
+    (figure) => `The ${judged} differ from the roof by ${figure} (RMSE).`,
+    (figure) => `The ${judged} differ from the roof by ${figure} (RMSE): dormers, chimneys or trees are not modelled.`);
+  add("unexplained_m2", "Roof without a point near it", { most: Math.max(2, UNEXPLAINED_SHARE * area) },
+    (figure) => (figure.startsWith("0.0") ? "Points lie on all of the roof." : `Points lie on nearly all of the roof; ${figure} have none.`),
+    (figure) => `${figure} of the roof have no point near them: the form there is assumed.`);
+  add("largest_hole_m", COLUMNS["largest_hole_m"].label, { most: HOLE_M },
+    (figure) => `The largest hole in the points is ${figure} wide.`,
+    (figure) => `The points have a hole ${figure} wide: what is there was not measured.`);
+  add("ridge_z_sigma_m", "Uncertainty of the ridge's height", { most: RIDGE_SIGMA_M },
+    (figure) => `The height of the ridge is known to ${figure} (one sigma).`,
+    (figure) => `The height of the ridge is known to ${figure} only (one sigma).`);
+  add("bic_margin", LEAD, { least: BIC_MARGIN },
+    (figure) => `No other form that was tried explains the points as well (lead ${figure}).`,
+    (figure) => `Another form explains the points almost as well (lead ${figure}): the roof's form is uncertain.`);
+  add("detection_confidence", COLUMNS["detection_confidence"].label, { least: CONFIDENCE },
+    (figure) => `It is a building with a confidence of ${figure}.`,
+    (figure) => `It may not be a building: the confidence is ${figure}.`);
+  add("footprint_share", COLUMNS["footprint_share"].label, { least: FOOTPRINT_SHARE },
+    (figure) => `The model fills ${figure} of the given footprint.`,
+    (figure) => `The model fills only ${figure} of the given footprint: the rest has no points.`);
   return figures;
 }
 
@@ -111,7 +103,7 @@ export function trust(properties: Properties, decisions: readonly Decision[]): {
   if (status === "doubtful") bad.push(`The model is doubtful: ${[words, detail].filter(Boolean).join(": ")}.`);
   if (status === "fallback") bad.push(`The roof is not modelled, the building is a block: ${words}.`);
   if (valid === true) good.push("The solid is closed and valid by the rules of ISO 19107.");
-  for (const figure of trustFigures(properties)) (figure.good ? good : bad).push(figure.words);
+  for (const figure of trustFigures(properties)) (figure.isGood ? good : bad).push(figure.words);
   if (properties["is_curved"] === true) bad.push("The roof is curved: planes only approximate it.");
   if (properties["touches_data_edge"] === true) bad.push("It touches the edge of the data: a part of it may be missing.");
   const offset = number(properties["strip_offset_m"]);
@@ -159,17 +151,17 @@ const CHECKS: Record<string, Check> = {
 };
 
 /** The figures that decided which forms were tried, next to their limits. */
-export function checkRows(decisions: readonly Decision[]): { label: string; value: string; limit: string; words: string }[] {
+export function checkRows(decisions: readonly Decision[]): Row[] {
   return decisions
     .filter(({ kind }) => kind === "check")
     .map(({ name, value, limit, outcome, detail }) => {
       const known = CHECKS[name];
       const show = known?.show ?? ((v: number) => measure(v, 3));
       return {
-        label: known?.label ?? capital(name.replaceAll("_", " ")),
-        value: value === undefined ? "–" : show(value),
-        limit: limit === undefined || limit === 0 ? "–" : `${known?.isMost ? "up to" : "from"} ${show(limit)}`,
-        words: (outcome === "met" ? known?.met : known?.missed) ?? detail,
+        Figure: known?.label ?? capital(name.replaceAll("_", " ")),
+        Value: value === undefined ? "–" : show(value),
+        Limit: limit === undefined || limit === 0 ? "–" : `${known?.isMost ? "up to" : "from"} ${show(limit)}`,
+        Meaning: (outcome === "met" ? known?.met : known?.missed) ?? detail,
       };
     });
 }
@@ -194,15 +186,18 @@ const OUTCOMES: Record<string, string> = {
   missed: "not met",
 };
 
+/** Outcomes of what became of the building. */
+export const CHOSEN = ["chosen", "made"];
+
 /** The forms and levels of detail that were tried, in their order: the figures of each by their heads. */
-export function formRows(decisions: readonly Decision[], properties: Properties): { chosen: boolean; cells: Record<string, string> }[] {
+export function formRows(decisions: readonly Decision[], properties: Properties): Row[] {
   const delivered = decisions.filter(({ kind, outcome }) => kind === "form" && outcome === "chosen").at(-1);
   return decisions
     .filter(({ kind }) => kind !== "check")
     .map((entry) => {
       const { kind, name, outcome, detail, validity_codes: codes = [] } = entry;
       const isLevel = kind === "level";
-      const cells = {
+      return {
         Form: isLevel ? `LoD${name}` : (FORMS[name] ?? name),
         Outcome: isLevel && outcome === "chosen" ? "made" : (OUTCOMES[outcome] ?? outcome),
         Faces: String(entry.n_faces ?? "–"),
@@ -212,6 +207,5 @@ export function formRows(decisions: readonly Decision[], properties: Properties)
         [LEAD]: measure(entry.bic_margin, 1),
         Notes: [detail, codes.length > 0 ? `codes ${codes.join(", ")}` : ""].filter(Boolean).join("; "),
       };
-      return { chosen: outcome === "chosen", cells };
     });
 }

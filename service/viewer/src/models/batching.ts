@@ -37,15 +37,27 @@ export interface Batch {
   edges: Float32Array;
 }
 
+/** What is known of buildings once they are read: their models, their entries for the list, their outlines. */
+export interface Gathered {
+  batches: Batch[];
+  listed: Listed[];
+  outlines: Outline[];
+}
+
 /** Gathers buildings by category until they are taken as batches. */
 export class Batcher {
-  private readonly open = new Map<Category, Gathered[]>();
+  private readonly open = new Map<Category, Meshed[]>();
+  private readonly listed: Listed[] = [];
   private readonly outlines: Outline[] = [];
 
   constructor(private readonly frame: SceneFrame) {}
 
-  /** Add a building; returns its entry for the list. */
-  add(building: Building): Listed {
+  /** Number of buildings since the last call of `take`. */
+  get size(): number {
+    return this.listed.length;
+  }
+
+  add(building: Building): void {
     const { attributes } = building;
     const category = categoryOf(attributes["status"], attributes["roof_type"]);
     const mesh = buildingMesh(building, this.frame);
@@ -58,34 +70,29 @@ export class Batcher {
       figures: figuresOf(attributes),
       flags: flagsOf(attributes),
     };
+    this.listed.push(listed);
     if (mesh.positions.length > 0) {
       const gathered = this.open.get(category) ?? [];
       this.open.set(category, gathered);
       gathered.push({ listed, mesh });
       this.outlines.push(outlineOf(building, category, this.frame));
     }
-    return listed;
   }
 
-  /** The batches of what was added since the last call. */
-  take(): Batch[] {
+  /** What was added since the last call. */
+  take(): Gathered {
     const batches = [...this.open].map(([category, gathered]) => merged(category, gathered));
     this.open.clear();
-    return batches;
-  }
-
-  /** The outlines of what was added since the last call. */
-  takeOutlines(): Outline[] {
-    return this.outlines.splice(0);
+    return { batches, listed: this.listed.splice(0), outlines: this.outlines.splice(0) };
   }
 }
 
-interface Gathered {
+interface Meshed {
   listed: Listed;
   mesh: BuildingMesh;
 }
 
-function merged(category: Category, all: readonly Gathered[]): Batch {
+function merged(category: Category, all: readonly Meshed[]): Batch {
   const n = all.length;
   const starts = new Uint32Array(n + 1);
   const edgeStarts = new Uint32Array(n + 1);

@@ -1,8 +1,7 @@
 import type { Feature } from "../api/types";
-import { Batcher, type Batch, type Listed } from "./batching";
+import { Batcher, type Gathered } from "./batching";
 import type { SceneFrame } from "./building_mesh";
 import type { Face } from "./cityjson";
-import type { Outline } from "./outlines";
 import { areaOf, polygonsOf } from "./plan";
 
 const ABOVE_GROUND_M = 0.25;
@@ -17,9 +16,8 @@ export function flatOutlines(
   status: "failed" | "rejected",
   frame: SceneFrame,
   groundAt: (x: number, y: number) => number,
-): { batches: Batch[]; listed: Listed[]; outlines: Outline[] } {
+): Gathered {
   const batcher = new Batcher({ origin: [0, 0, 0], horizontalUnitM: 1, verticalUnitM: 1 });
-  const listed: Listed[] = [];
   for (const { geometry, properties, id } of features) {
     const name = properties["building_id"] ?? properties["object_id"] ?? id;
     if (typeof name !== "string") continue;
@@ -40,7 +38,7 @@ export function flatOutlines(
     // a face must be planar
     const top = vertices.reduce((highest, [, , z]) => Math.max(highest, z), -Infinity);
     const level = Float64Array.from(vertices.flatMap(([x, y]) => [x, y, top]));
-    listed.push(batcher.add({ id: name, attributes: { ...properties, status }, vertices: level, faces, levels: [] }));
+    batcher.add({ id: name, attributes: { ...properties, status }, vertices: level, faces, levels: [] });
   }
-  return { batches: batcher.take(), listed, outlines: batcher.takeOutlines() };
+  return batcher.take();
 }

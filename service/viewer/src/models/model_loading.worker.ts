@@ -1,9 +1,8 @@
 /** Reads and triangulates the models in a worker, which keeps the page responsive. It fetches nothing itself. */
 
 import { jsonLines } from "../api/lines";
-import { Batcher, type Batch, type Listed } from "./batching";
+import { Batcher, type Gathered } from "./batching";
 import { SequenceReader, type Building } from "./cityjson";
-import type { Outline } from "./outlines";
 
 /** A piece of the CityJSONSeq for the worker. */
 export interface ToLoading {
@@ -22,7 +21,7 @@ export type Reading = Omit<ToLoading, "bytes">;
 /** Messages of the worker. */
 export type FromLoading =
   | { kind: "frame"; origin: [number, number, number] }
-  | { kind: "buildings"; listed: Listed[]; batches: Batch[]; outlines: Outline[] }
+  | ({ kind: "buildings" } & Gathered)
   /** The levels of detail to choose from, coarse to fine; empty if each building has one. */
   | { kind: "finished"; levels: string[] }
   | { kind: "failed"; detail: string };
@@ -57,14 +56,7 @@ async function read({ horizontalUnitM, verticalUnitM, lod }: Reading): Promise<v
   const reader = new SequenceReader(lod);
   const early: Building[] = []; // those without a vertex, before the origin is known
   let batcher: Batcher | null = null;
-  let listed: Listed[] = [];
   let size = FIRST_BATCH;
-  const give = (): void => {
-    if (batcher === null) return;
-    const batches = batcher.take();
-    tell({ kind: "buildings", listed, batches, outlines: batcher.takeOutlines() }, batches.flatMap(buffersOf));
-    listed = [];
-  };
   for await (const line of jsonLines(arriving())) {
     const building = reader.read(line);
     if (building === null) continue;
@@ -77,15 +69,15 @@ async function read({ horizontalUnitM, verticalUnitM, lod }: Reading): Promise<v
       batcher = new Batcher({ origin, horizontalUnitM, verticalUnitM });
       tell({ kind: "frame", origin });
     }
-    listed.push(batcher.add(building));
-    if (listed.length >= size) {
-      give();
+    batcher.add(building);
+    if (batcher.size >= size) {
+      give(batcher);
       size *= 2;
     }
   }
   batcher ??= new Batcher({ origin: [0, 0, 0], horizontalUnitM, verticalUnitM });
-  for (const building of early) listed.push(batcher.add(building));
-  give();
+  for (const building of early) batcher.add(building);
+  give(batcher);
   tell({ kind: "finished", levels: reader.levels });
 }
 
@@ -98,9 +90,12 @@ function originOf(reader: SequenceReader, { vertices }: Building): [number, numb
   return [Math.round(vertices[0]), Math.round(vertices[1]), Math.floor(vertices[2])];
 }
 
-/** What is handed over and not copied: the arrays of a batch. */
-function buffersOf(batch: Batch): Transferable[] {
-  return Object.values(batch).flatMap((value) => (ArrayBuffer.isView(value) ? [value.buffer as ArrayBuffer] : []));
+/** Give what is read to the page; the arrays of the batches are handed over and not copied. */
+function give(batcher: Batcher): void {
+  const taken = batcher.take();
+  const values = taken.batches.flatMap((batch) => Object.values(batch) as unknown[]);
+  const buffers = values.filter(ArrayBuffer.isView).map(({ buffer }) => buffer as ArrayBuffer);
+  tell({ kind: "buildings", ...taken }, buffers);
 }
 
 function tell(message: FromLoading, transfer: Transferable[] = []): void {

@@ -3,12 +3,11 @@
 import { getJson, partOf, runReport, type Run } from "../api/requests";
 import type { Feature, RunReport } from "../api/types";
 import type { Category } from "../words/roof_types";
-import type { Listed } from "./batching";
+import type { Gathered, Listed } from "./batching";
 import type { SceneFrame } from "./building_mesh";
 import { loadModels, type FromLoading } from "./model_loading";
+import { ringsOf } from "./plan";
 import { modelUnits } from "./units";
-
-type Buildings = Extract<FromLoading, { kind: "buildings" }>;
 
 export class RunObjects implements Run {
   readonly listed: Listed[] = [];
@@ -47,7 +46,7 @@ export class RunObjects implements Run {
   }
 
   /** Read the models at a level of detail, null for the finest of each; returns the available levels. */
-  readModels(lod: string | null, onBuildings: (buildings: Buildings) => void, signal: AbortSignal): Promise<string[]> {
+  readModels(lod: string | null, onBuildings: (buildings: Gathered) => void, signal: AbortSignal): Promise<string[]> {
     const onMessage = (message: FromLoading): void => {
       if (message.kind === "frame" && lod === null) this.origin = message.origin;
       if (message.kind === "buildings") onBuildings(message);
@@ -59,7 +58,7 @@ export class RunObjects implements Run {
   async failed(signal: AbortSignal): Promise<Feature[]> {
     const path = partOf(this, "buildings?status=failed&limit=10000&crs=native");
     const { features } = await getJson<{ features: Feature[] }>(path, { signal, headers: { Accept: "application/geo+json" } });
-    this.placeBy(features);
+    this.origin ??= cornerOf(features);
     return features;
   }
 
@@ -67,21 +66,13 @@ export class RunObjects implements Run {
   async readRejected(signal: AbortSignal): Promise<Feature[]> {
     const { rejectedObjects } = await import("./rejected_objects");
     const features = await rejectedObjects(this, signal);
-    this.placeBy(features);
-    return features;
-  }
-
-  /** Take the scene's origin from outlines if there is no model: far from it the figures would be too coarse. */
-  private placeBy(features: readonly Feature[]): void {
     this.origin ??= cornerOf(features);
+    return features;
   }
 }
 
-/** A corner of the first outline, in whole units; null without outlines. */
+/** A corner of the first outline, in whole units: where there is no model, the figures would be too coarse far from it. */
 function cornerOf(features: readonly Feature[]): [number, number, number] | null {
-  for (const { geometry } of features) {
-    const [easting, northing] = ((geometry?.coordinates as unknown[] | undefined)?.flat(3) as number[]) ?? [];
-    if (typeof easting === "number" && typeof northing === "number") return [Math.round(easting), Math.round(northing), 0];
-  }
-  return null;
+  const corner = features.flatMap(({ geometry }) => ringsOf(geometry))[0]?.[0];
+  return corner === undefined ? null : [Math.round(corner[0]), Math.round(corner[1]), 0];
 }

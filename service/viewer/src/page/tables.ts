@@ -12,12 +12,23 @@ export interface Column<T> {
 }
 
 /**
- * A table in a frame; the first cell of a row is its head.
+ * A table in a frame.
  *
  * @param name For screen readers.
  * @param row The attributes of the row of an entry.
  */
-export function table<T>(name: string, columns: readonly Column<T>[], entries: readonly T[], row: (entry: T) => Properties = () => ({})): HTMLElement {
+export function table<T>(name: string, columns: readonly Column<T>[], entries: readonly T[], row?: (entry: T) => Properties): HTMLElement {
+  const properties = { class: "rows", "aria-label": name };
+  return el("div", { class: "table-frame" }, bareTable(properties, columns, entries, row));
+}
+
+/** The same without a frame; the first cell of a row is its head. */
+export function bareTable<T>(
+  properties: Properties,
+  columns: readonly Column<T>[],
+  entries: readonly T[],
+  row: (entry: T) => Properties = () => ({}),
+): HTMLElement {
   const heads = columns.map(({ head, kind }) => el("th", { scope: "col", class: kind }, head));
   const rows = entries.map((entry) =>
     el("tr", row(entry), ...columns.map(({ kind, cell, title }, at) => {
@@ -25,11 +36,7 @@ export function table<T>(name: string, columns: readonly Column<T>[], entries: r
       return el(isHead ? "th" : "td", { scope: isHead ? "row" : null, class: kind, title: title?.(entry) }, ...[cell(entry)].flat());
     })),
   );
-  return el(
-    "div",
-    { class: "table-frame" },
-    el("table", { class: "rows", "aria-label": name }, el("thead", {}, el("tr", {}, ...heads)), el("tbody", {}, ...rows)),
-  );
+  return el("table", properties, el("thead", {}, el("tr", {}, ...heads)), el("tbody", {}, ...rows));
 }
 
 /** A further line in a cell; null if it says nothing. */

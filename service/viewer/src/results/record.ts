@@ -9,7 +9,7 @@ import { COLUMN_NAMES, COLUMNS, shown } from "../models/columns";
 import { FIGURES, figureWords, type FigureName } from "../models/figures";
 import { el, swatch } from "../page/elements";
 import { report, warningNotice } from "../page/notices";
-import { facts } from "../page/tables";
+import { bareTable, facts, type Column } from "../page/tables";
 import { capital, reasonWords } from "../words/fields";
 import { measure } from "../words/numbers";
 import { CATEGORIES, categoryOf, type Category } from "../words/roof_types";
@@ -92,11 +92,11 @@ const PLANE_FIGURES = [
 /** Slope and aspect of each roof plane. */
 function planes(value: unknown): HTMLElement | null {
   if (!Array.isArray(value) || value.length === 0) return null;
-  const heads = PLANE_FIGURES.map(([head]) => el("th", { scope: "col" }, head));
-  const rows = (value as Properties[]).map((plane) =>
-    el("tr", {}, ...PLANE_FIGURES.map(([, name, digits, unit]) => el("td", {}, measure(plane[name], digits, unit)))),
-  );
-  return el("section", {}, el("h3", {}, "Roof planes"), el("table", {}, el("thead", {}, el("tr", {}, ...heads)), el("tbody", {}, ...rows)));
+  const columns = PLANE_FIGURES.map(([head, name, digits, unit]): Column<Properties> => ({
+    head,
+    cell: (plane) => measure(plane[name], digits, unit),
+  }));
+  return el("section", {}, el("h3", {}, "Roof planes"), bareTable({}, columns, value as Properties[]));
 }
 
 /** Downloads of one building; a job has meshes of one kind, or none. */
