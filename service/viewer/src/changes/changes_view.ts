@@ -5,6 +5,7 @@ import type { StatusInfo } from "../api/types";
 import { titleOf, whenWords } from "../jobs/job_words";
 import type { Batch, Gathered, Listed } from "../models/batching";
 import { originInMetres } from "../models/building_mesh";
+import { figureWords } from "../models/figures";
 import { CHANGES, LIMITS, pairs, type Change, type Pair, type Placed } from "../models/pairing";
 import { RunObjects } from "../models/run_objects";
 import { countOf } from "../models/selection";
@@ -18,7 +19,7 @@ import { Tick } from "../page/tick";
 import type { View } from "../page/view";
 import type { OnMove } from "../scene/camera";
 import { ModelScene } from "../scene/scene";
-import { count, counted, measure } from "../words/numbers";
+import { count, counted } from "../words/numbers";
 import { CATEGORIES } from "../words/roof_types";
 import "./changes_view.css";
 
@@ -346,11 +347,6 @@ function sorted(found: Pair[]): Pair[] {
 
 function figures(one: Listed | null): string {
   if (one === null) return "–";
-  const { height, area } = one.figures;
-  const parts = [
-    CATEGORIES[one.category].label,
-    height === undefined ? null : measure(height, 1, "m"),
-    area === undefined ? null : measure(area, 0, "m²"),
-  ];
+  const parts = [CATEGORIES[one.category].label, figureWords("height", one.figures), figureWords("area", one.figures)];
   return parts.filter((part) => part !== null).join(" · ");
 }

@@ -4,7 +4,7 @@ import { inOrder, levelShown } from "./levels_of_detail";
 
 export type Xyz = [number, number, number];
 
-export interface Transform {
+interface Transform {
   scale: Xyz;
   translate: Xyz;
 }
@@ -32,12 +32,6 @@ export interface Building {
   levels: string[];
 }
 
-export interface Metadata {
-  transform: Transform;
-  /** x_min, y_min, z_min, x_max, y_max, z_max; null if nothing was modelled. */
-  extent: number[] | null;
-}
-
 const KINDS: Record<string, SurfaceKind> = { RoofSurface: "roof", GroundSurface: "ground", WallSurface: "wall" };
 
 /**
@@ -46,7 +40,9 @@ const KINDS: Record<string, SurfaceKind> = { RoofSurface: "roof", GroundSurface:
  * @throws Error if a line is not JSON, or a feature comes before the first line of metadata.
  */
 export class SequenceReader {
-  metadata: Metadata | null = null;
+  /** x_min, y_min, z_min, x_max, y_max, z_max; null if nothing was modelled. */
+  extent: readonly number[] | null = null;
+  private transform: Transform | null = null;
   private readonly several = new Set<string>();
 
   /** @param lod The level of detail to read: for each building the finest level up to this one; null for its finest. */
@@ -55,12 +51,13 @@ export class SequenceReader {
   read(line: string): Building | null {
     const value = JSON.parse(line) as RawLine;
     if (value.type === "CityJSON") {
-      this.metadata = metadataOf(value);
+      this.transform = value.transform ?? { scale: [1, 1, 1], translate: [0, 0, 0] };
+      this.extent = value.metadata?.geographicalExtent ?? null;
       return null;
     }
     if (value.type !== "CityJSONFeature") throw new Error(`a line of type ${String(value.type)} in the CityJSONSeq`);
-    if (this.metadata === null) throw new Error("the CityJSONSeq does not begin with its metadata");
-    const building = featureOf(value, this.metadata.transform, this.lod);
+    if (this.transform === null) throw new Error("the CityJSONSeq does not begin with its metadata");
+    const building = featureOf(value, this.transform, this.lod);
     if (building.levels.length > 1) for (const level of building.levels) this.several.add(level);
     return building;
   }
@@ -93,13 +90,6 @@ interface RawLine {
   metadata?: { geographicalExtent?: number[] };
   CityObjects?: Record<string, { type: string; attributes?: Record<string, unknown>; geometry?: RawGeometry[] }>;
   vertices?: Xyz[];
-}
-
-function metadataOf(line: RawLine): Metadata {
-  return {
-    transform: line.transform ?? { scale: [1, 1, 1], translate: [0, 0, 0] },
-    extent: line.metadata?.geographicalExtent ?? null,
-  };
 }
 
 function featureOf(line: RawLine, { scale, translate }: Transform, lod: string | null): Building {

@@ -2,7 +2,7 @@
 
 import { Color } from "three";
 import { reasonWords } from "../words/fields";
-import { CATEGORIES } from "../words/roof_types";
+import { CATEGORIES, isHatched, type Category } from "../words/roof_types";
 import type { Batch, Listed } from "./batching";
 import { SURFACE } from "./building_mesh";
 import { countOf } from "./selection";
@@ -41,15 +41,14 @@ const RESIDUALS: readonly (ColourClass & { fromShare: number })[] = [
   { label: "unknown", colour: GREY, fromShare: NaN },
 ];
 
+const drawn = (category: Category): ColourClass => ({ ...CATEGORIES[category], hatched: isHatched(category) });
 const STATUSES: readonly ColourClass[] = [
-  { label: "Modelled", colour: "#56b4e9" },
-  { label: "Doubtful model", colour: CATEGORIES.doubtful.colour, hatched: true },
-  { label: "Fallback block", colour: CATEGORIES.fallback.colour, hatched: true },
-  { label: "No model", colour: CATEGORIES.failed.colour, hatched: true },
+  { label: "Modelled", colour: CATEGORIES.flat.colour },
+  ...(["doubtful", "fallback", "failed"] as const).map(drawn),
 ];
 
 /** Objects that were judged not to be buildings. */
-const LEFT_OUT: ColourClass = { label: "Left out", colour: CATEGORIES.rejected.colour, hatched: true };
+const LEFT_OUT = drawn("rejected");
 
 const REASON_COLOURS: Record<string, string> = {
   too_few_points: "#56b4e9",

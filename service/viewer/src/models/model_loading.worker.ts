@@ -2,7 +2,7 @@
 
 import { jsonLines } from "../api/lines";
 import { Batcher, type Gathered } from "./batching";
-import { SequenceReader, type Building } from "./cityjson";
+import { SequenceReader } from "./cityjson";
 
 /** A piece of the CityJSONSeq for the worker. */
 export interface ToLoading {
@@ -54,40 +54,32 @@ async function* arriving(): AsyncGenerator<Uint8Array> {
 
 async function read({ horizontalUnitM, verticalUnitM, lod }: Reading): Promise<void> {
   const reader = new SequenceReader(lod);
-  const early: Building[] = []; // those without a vertex, before the origin is known
   let batcher: Batcher | null = null;
   let size = FIRST_BATCH;
   for await (const line of jsonLines(arriving())) {
     const building = reader.read(line);
     if (building === null) continue;
-    if (batcher === null && building.vertices.length === 0) {
-      early.push(building);
-      continue;
-    }
-    if (batcher === null) {
-      const origin = originOf(reader, building);
-      batcher = new Batcher({ origin, horizontalUnitM, verticalUnitM });
-      tell({ kind: "frame", origin });
-    }
+    batcher ??= new Batcher({ origin: originOf(reader), horizontalUnitM, verticalUnitM });
     batcher.add(building);
     if (batcher.size >= size) {
       give(batcher);
       size *= 2;
     }
   }
-  batcher ??= new Batcher({ origin: [0, 0, 0], horizontalUnitM, verticalUnitM });
-  for (const building of early) batcher.add(building);
-  give(batcher);
+  if (batcher !== null) give(batcher);
   tell({ kind: "finished", levels: reader.levels });
 }
 
-/** Whole units in the middle of all models, or at the first one's corner. */
-function originOf(reader: SequenceReader, { vertices }: Building): [number, number, number] {
-  const extent = reader.metadata?.extent;
-  if (extent?.length === 6) {
-    return [Math.round((extent[0] + extent[3]) / 2), Math.round((extent[1] + extent[4]) / 2), Math.floor(extent[2])];
-  }
-  return [Math.round(vertices[0]), Math.round(vertices[1]), Math.floor(vertices[2])];
+/** Whole units in the middle of all models; without models their place does not matter. */
+function originOf({ extent }: SequenceReader): [number, number, number] {
+  if (extent === null) return [0, 0, 0];
+  const origin: [number, number, number] = [
+    Math.round((extent[0] + extent[3]) / 2),
+    Math.round((extent[1] + extent[4]) / 2),
+    Math.floor(extent[2]),
+  ];
+  tell({ kind: "frame", origin });
+  return origin;
 }
 
 /** Give what is read to the page; the arrays of the batches are handed over and not copied. */

@@ -42,16 +42,12 @@ export const USUAL: Wanted = {
 
 /** Whether something is filtered: not all buildings are shown, or more than buildings. */
 export function isFiltered(wanted: Wanted): boolean {
-  return addressed(filtersOf(wanted)).size > 0;
+  return addressed({ ...wanted, sort: USUAL.sort, descending: false, map: false }).size > 0;
 }
 
 /** The same order and view without any filter. */
 export function unfiltered({ sort, descending, map }: Wanted): Wanted {
   return { ...USUAL, sort, descending, map };
-}
-
-function filtersOf({ text, hidden, reasons, flags, ranges }: Wanted): Wanted {
-  return { ...USUAL, text, hidden, reasons, flags, ranges };
 }
 
 // --- the address

@@ -51,17 +51,6 @@ export interface PointsFile {
   originM: Xyz;
 }
 
-/**
- * The points of a file of one node, as a run writes it.
- *
- * @throws Error if the file is damaged or of another kind.
- */
-export function readPoints(file: ArrayBuffer): NodePoints {
-  const [node] = readNodes(file).nodes;
-  if (node === undefined) throw new Error("the file has no node of points");
-  return node;
-}
-
 /** @throws Error if the file is damaged or of another kind. */
 export function readNodes(file: ArrayBuffer): PointsFile {
   const { gltf, binary } = chunksOf(file);

@@ -2,7 +2,7 @@
 
 import { Box3, BufferAttribute, BufferGeometry, Frustum, Group, Matrix4, Points, Ray, Vector3, type PerspectiveCamera } from "three";
 import type { Layer } from "../scene/layer";
-import { readPoints, type NodePoints } from "./points_glb";
+import { readNodes, type NodePoints } from "./points_glb";
 import { PointsMaterial } from "./points_material";
 import { selected } from "./points_selection";
 import { rootOf, type RawTileset, type Tile, type Xyz } from "./points_tileset";
@@ -170,7 +170,8 @@ export class PointsLayer implements Layer {
       tile.tileset = null;
       return;
     }
-    const points = readPoints(await this.fetched(tile.points as string, signal));
+    const [points] = readNodes(await this.fetched(tile.points as string, signal)).nodes;
+    if (points === undefined) throw new Error("the file has no node of points");
     if (signal.aborted) return;
     this.loaded.set(tile, { points, drawn: this.drawnOf(tile, points), used: this.frame });
     this.figures.kept += points.count;

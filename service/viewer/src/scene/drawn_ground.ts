@@ -1,6 +1,6 @@
 /** The ground as it is drawn: guessed from the floors of the models, or measured. */
 
-import { BufferAttribute, BufferGeometry, Group, Mesh, MeshLambertMaterial, type Ray } from "three";
+import { BufferAttribute, Group, MathUtils, Mesh, MeshLambertMaterial, PlaneGeometry, type Ray } from "three";
 import { groundDistance, heightAt, type Ground } from "./ground";
 
 export class DrawnGround {
@@ -38,32 +38,19 @@ export class DrawnGround {
 
 /** The ground as a mesh. What is only guessed from floors fades out towards its border. */
 function groundMesh(ground: Ground, isGuessed: boolean): Mesh {
-  const { nx, ny, cellM } = ground;
-  const positions = new Float32Array(3 * nx * ny);
+  const { xMin, yMin, nx, ny, cellM, heights } = ground;
+  const [width, depth] = [cellM * (nx - 1), cellM * (ny - 1)];
+  const geometry = new PlaneGeometry(width, depth, nx - 1, ny - 1).translate(xMin + width / 2, yMin + depth / 2, 0);
+  const [position, uv] = [geometry.getAttribute("position"), geometry.getAttribute("uv")];
   const colours = new Float32Array(4 * nx * ny).fill(1);
-  for (let row = 0; row < ny; row++) {
-    for (let column = 0; column < nx; column++) {
-      const at = row * nx + column;
-      // a little below the floors, which would otherwise flicker through
-      positions.set([ground.xMin + column * cellM, ground.yMin + row * cellM, ground.heights[at] - 0.06], 3 * at);
-      const u = (2 * column) / (nx - 1) - 1;
-      const v = (2 * row) / (ny - 1) - 1;
-      if (!isGuessed) continue;
-      const fade = Math.min(Math.max((1 - Math.hypot(u, v)) / 0.35, 0), 1);
-      colours[4 * at + 3] = fade * fade * (3 - 2 * fade);
-    }
+  for (let at = 0; at < nx * ny; at++) {
+    const row = ny - 1 - Math.floor(at / nx); // the plane begins in the north
+    // a little below the floors, which would otherwise flicker through
+    position.setZ(at, heights[row * nx + (at % nx)] - 0.06);
+    const fromMiddle = Math.hypot(2 * uv.getX(at) - 1, 2 * uv.getY(at) - 1);
+    if (isGuessed) colours[4 * at + 3] = MathUtils.smoothstep(1 - fromMiddle, 0, 0.35);
   }
-  const index: number[] = [];
-  for (let row = 0; row + 1 < ny; row++) {
-    for (let column = 0; column + 1 < nx; column++) {
-      const a = row * nx + column;
-      index.push(a, a + 1, a + nx, a + 1, a + nx + 1, a + nx);
-    }
-  }
-  const geometry = new BufferGeometry();
-  geometry.setAttribute("position", new BufferAttribute(positions, 3));
   geometry.setAttribute("color", new BufferAttribute(colours, 4));
-  geometry.setIndex(index);
   geometry.computeVertexNormals();
   // farther back than models are: outlines lie just above the ground, and would be hidden seen from afar
   const offset = { polygonOffset: true, polygonOffsetFactor: 3, polygonOffsetUnits: 3 };
