@@ -10,7 +10,7 @@ import { CHANGES, LIMITS, pairs, type Change, type Pair, type Placed } from "../
 import { RunObjects } from "../models/run_objects";
 import { countOf } from "../models/selection";
 import { hashOf, partsOf, type Address } from "../page/address";
-import { button, colourSwatch, el, type Properties } from "../page/elements";
+import { button, colourSwatch, el, refill, type Properties } from "../page/elements";
 import { choice, field } from "../page/form_fields";
 import { announce, report, warningNotice } from "../page/notices";
 import { sheet } from "../page/sheet";
@@ -272,7 +272,7 @@ class Changes implements View {
     };
     const further = button(`Show ${count(Math.min(rest, STEP))} more of ${count(rest)}`, showMore, { class: "quiet wide", hidden: rest === 0 });
     const isChosen = (pair: Pair): Properties => ({ "aria-current": idOf(pair) === this.selected ? "true" : null });
-    this.list.replaceChildren(table("Differences", this.columns, listed.slice(0, this.more), isChosen), further);
+    refill(this.list, table("Differences", this.columns, listed.slice(0, this.more), isChosen), further);
   }
 
   // --- the selection
@@ -299,11 +299,7 @@ class Changes implements View {
     const leads = now !== null && right?.models.has(now) === true ? right : left;
     left?.select(old, fly && leads === left);
     right?.select(now, fly && leads === right);
-    for (const row of this.list.querySelectorAll("tbody tr")) {
-      const isIt = pair !== undefined && row.querySelector("a")?.getAttribute("href") === this.address(this.selected);
-      row.toggleAttribute("aria-current", isIt);
-      if (isIt) row.setAttribute("aria-current", "true");
-    }
+    if (!this.legend.hidden) this.rows();
   }
 }
 

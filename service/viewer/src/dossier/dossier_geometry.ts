@@ -3,6 +3,7 @@
 import { inScene, originInMetres, type SceneFrame } from "../models/building_mesh";
 import type { Building, Face } from "../models/cityjson";
 import { areaOf, type Point } from "../models/plan";
+import { countOf } from "../models/selection";
 import { ringNormal, type Normal } from "../models/triangulation";
 import { NO_PLANE, NO_RESIDUAL, readNodes, RESIDUAL_SHIFT } from "../points/points_glb";
 
@@ -77,11 +78,9 @@ export function roofEdges(model: Model): RoofEdge[] {
     }
   }
   const edges: RoofEdge[] = [];
-  const inPlan = new Map<string, number>();
   const planKey = (p: Xyz, q: Xyz): string => [key([p[0], p[1], 0]), key([q[0], q[1], 0])].sort().join(" ");
-  for (const { from, to, normals } of sides.values()) {
-    if (normals.length === 1) inPlan.set(planKey(from, to), (inPlan.get(planKey(from, to)) ?? 0) + 1);
-  }
+  const alone = [...sides.values()].filter(({ normals }) => normals.length === 1);
+  const inPlan = countOf(alone.map(({ from, to }) => planKey(from, to)));
   for (const { from, to, normals } of sides.values()) {
     const [first, second] = normals;
     if (second === undefined) {
@@ -126,13 +125,8 @@ function measured(model: Model, face: Face): { area: number; normal: Normal; mid
 }
 
 function longestSide(edges: readonly RoofEdge[]): Point {
-  let best: Point = [1, 0];
-  let longest = 0;
-  for (const { from, to } of edges) {
-    const side = [to[0] - from[0], to[1] - from[1]] as const;
-    if (Math.hypot(...side) > longest) [longest, best] = [Math.hypot(...side), unit(side)];
-  }
-  return best;
+  const sides = edges.map(({ from, to }): Point => [to[0] - from[0], to[1] - from[1]]);
+  return unit(sides.reduce((longest, side) => (Math.hypot(...side) > Math.hypot(...longest) ? side : longest), [0, 0]));
 }
 
 function unit([x, y]: Point): Point {

@@ -182,8 +182,6 @@ const OUTCOMES: Record<string, string> = {
   invalid: "not a valid solid",
   undrawable: "cannot be drawn",
   withdrawn: "given up: see below",
-  met: "met",
-  missed: "not met",
 };
 
 /** Outcomes of what became of the building. */

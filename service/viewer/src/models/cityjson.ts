@@ -122,17 +122,11 @@ function facesOf(geometry: RawGeometry): Face[] {
       const value: unknown = Array.isArray(semantic) ? semantic[i] : undefined;
       return faceOf(rings, typeof value === "number" ? surfaces[value] : undefined);
     });
-  switch (geometry.type) {
-    case "MultiSurface":
-    case "CompositeSurface":
-      return shell(geometry.boundaries as Rings[], values);
-    case "Solid":
-      return (geometry.boundaries as Rings[][]).flatMap((faces, i) =>
-        shell(faces, Array.isArray(values) ? values[i] : undefined),
-      );
-    default:
-      return [];
+  if (geometry.type === "Solid") {
+    const shells = geometry.boundaries as Rings[][];
+    return shells.flatMap((faces, i) => shell(faces, Array.isArray(values) ? values[i] : undefined));
   }
+  return geometry.type.endsWith("Surface") ? shell(geometry.boundaries as Rings[], values) : [];
 }
 
 function faceOf(rings: Rings, surface: RawSurface | undefined): Face {

@@ -1,6 +1,6 @@
 import type { Listed } from "../models/batching";
 import { FIGURES, figureWords, type FigureName } from "../models/figures";
-import { el, swatch } from "../page/elements";
+import { el, onKeys, swatch } from "../page/elements";
 import { count } from "../words/numbers";
 import { reasonWords } from "../words/fields";
 import { CATEGORIES } from "../words/roof_types";
@@ -35,7 +35,15 @@ export class BuildingList {
       if (this.element.isConnected) this.scrolled = this.element.scrollTop;
       this.request();
     });
-    this.list.addEventListener("keydown", (event) => this.typed(event));
+    const page = (): number => Math.floor(this.element.clientHeight / this.rowPx);
+    onKeys(this.list, {
+      ArrowDown: () => this.step(1),
+      ArrowUp: () => this.step(-1),
+      PageDown: () => this.step(page()),
+      PageUp: () => this.step(-page()),
+      Home: () => this.step(-Infinity),
+      End: () => this.step(Infinity),
+    });
     this.list.addEventListener("focusin", (event) => {
       const id = (event.target as Element).closest<HTMLElement>("li")?.dataset["id"];
       if (id !== undefined) this.mark(id);
@@ -167,22 +175,11 @@ export class BuildingList {
     this.draw();
   }
 
-  private typed(event: KeyboardEvent): void {
+  /** Focus the row so many places on, or the one at the end. */
+  private step(by: number): void {
     const at = this.current === null ? undefined : this.places.get(this.current);
-    if (at === undefined || event.ctrlKey || event.metaKey || event.altKey) return;
-    const page = Math.floor(this.element.clientHeight / this.rowPx);
-    const last = this.objects.length - 1;
-    const aim = {
-      ArrowDown: at + 1,
-      ArrowUp: at - 1,
-      PageDown: at + page,
-      PageUp: at - page,
-      Home: 0,
-      End: last,
-    }[event.key];
-    if (aim === undefined) return;
-    event.preventDefault();
-    this.focus(this.objects[Math.min(Math.max(aim, 0), last)].id);
+    if (at === undefined) return;
+    this.focus(this.objects[Math.min(Math.max(at + by, 0), this.objects.length - 1)].id);
   }
 }
 

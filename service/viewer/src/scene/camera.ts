@@ -1,6 +1,6 @@
 /** Where the view is seen from: it flies to what it shows, and may follow another view. */
 
-import { MathUtils, PerspectiveCamera, Raycaster, Vector2, Vector3, type Box3, type Ray } from "three";
+import { MathUtils, PerspectiveCamera, Vector3, type Box3 } from "three";
 import { framing } from "./framing";
 import { EYE_M, Navigation, type Surfaces } from "./navigation";
 
@@ -21,7 +21,6 @@ export class Camera {
   readonly view = new PerspectiveCamera(FOV_DEG, 1, 1, 10_000);
   readonly navigation: Navigation;
   private readonly still = matchMedia("(prefers-reduced-motion: reduce)");
-  private readonly caster = new Raycaster();
   private flight: { from: number; start: [Vector3, Vector3]; end: [Vector3, Vector3] } | null = null;
   private onMove: OnMove | null = null;
   /** The view that `onMove` knows. */
@@ -85,13 +84,6 @@ export class Camera {
   setAspect(aspect: number): void {
     this.view.aspect = aspect;
     this.view.updateProjectionMatrix();
-  }
-
-  /** The ray through a place of the view, -1 to 1 in both directions; it is good until the next one is asked for. */
-  ray(at: Vector2): Ray {
-    this.view.updateMatrixWorld();
-    this.caster.setFromCamera(at, this.view);
-    return this.caster.ray;
   }
 
   /** Move on by a frame. */

@@ -218,7 +218,8 @@ export class Navigation {
     this.remember();
   }
 
-  private ray(at: Vector2): Ray {
+  /** The ray through a place of the view, -1 to 1 in both directions. */
+  ray(at: Vector2): Ray {
     this.camera.updateMatrixWorld();
     const { position } = this.camera;
     const direction = new Vector3(at.x, at.y, 0.5).unproject(this.camera).sub(position).normalize();
@@ -226,7 +227,7 @@ export class Navigation {
   }
 
   /** A place of the page, within the view: -1 to 1. */
-  private inView(x: number, y: number): Vector2 {
+  inView(x: number, y: number): Vector2 {
     const frame = this.canvas.getBoundingClientRect();
     return new Vector2((2 * (x - frame.left)) / frame.width - 1, 1 - (2 * (y - frame.top)) / frame.height);
   }

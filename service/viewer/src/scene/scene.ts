@@ -253,8 +253,8 @@ export class ModelScene {
 
   /** The ray through a place of the page. */
   private ray(clientX: number, clientY: number): Ray {
-    const { left, top, width, height } = this.canvas.getBoundingClientRect();
-    return this.camera.ray(new Vector2((2 * (clientX - left)) / width - 1, 1 - (2 * (clientY - top)) / height));
+    const { navigation } = this.camera;
+    return navigation.ray(navigation.inView(clientX, clientY));
   }
 
   /** What the camera may meet. */
