@@ -61,8 +61,8 @@ test("residual, status and reason colour a whole roof as the legend says", () =>
   const { batches, listed } = batched();
   for (const colouring of ["residual", "status", "reason"] as const) {
     for (const { id } of HOUSES) {
-      const batch = batches.find(({ ids }) => ids.includes(id)) as Batch;
-      const roofs = surfaceColours(batch, batch.ids.indexOf(id), colouring);
+      const batch = batches.find(({ listed: those }) => those.some((one) => one.id === id)) as Batch;
+      const roofs = surfaceColours(batch, batch.listed.findIndex((one) => one.id === id), colouring);
       const [own] = classesOf(colouring, listed.filter((one) => one.id === id));
       expect(new Set([roofs.get(0), roofs.get(1)])).toEqual(new Set([linear(own.colour).join()]));
     }
@@ -108,12 +108,12 @@ test("a chimney does not turn a roof red: its few points leave the class, howeve
 
 test("single buildings have a colour of their own, the others that of their type", () => {
   const { batches } = batched();
-  const batch = batches.find(({ ids }) => ids.includes("b")) as Batch;
+  const batch = batches.find(({ listed }) => listed.some(({ id }) => id === "b")) as Batch;
   const colours = coloursOf(batch, (id) => (id === "b" ? "#ff0080" : null));
-  const roofs = batch.ids.map((_, n) => {
+  const roofs = batch.listed.map((_, n) => {
     const corner = [...batch.surfaces].findIndex((surface, at) => at >= batch.starts[n] && surface >= 0);
     return [...colours.subarray(4 * corner, 4 * corner + 4)];
   });
   const own = [...linear(CATEGORIES[batch.category].colour), 255];
-  expect(roofs).toEqual(batch.ids.map((id) => (id === "b" ? [255, 0, 55, 255] : own)));
+  expect(roofs).toEqual(batch.listed.map(({ id }) => (id === "b" ? [255, 0, 55, 255] : own)));
 });

@@ -38,7 +38,7 @@ describe("outlines", () => {
         { type: "Feature", geometry: null, properties: { object_id: "nowhere" } },
       ];
       const { batches, outlines } = flatOutlines(features, "rejected", FRAME, () => 2);
-      expect(batches.map(({ category, ids }) => [category, ids])).toEqual([["rejected", ["yard"]]]);
+      expect(batches.map(({ category, listed }) => [category, listed.map(({ id }) => id)])).toEqual([["rejected", ["yard"]]]);
       expect(batches[0].boxes[2]).toBeCloseTo(2.25, 5);
       expect(outlines.map(({ id, category, rings }) => [id, category, rings.length])).toEqual([["yard", "rejected", 2]]);
       expect(areaOf(outlines[0].rings[0])).toBeCloseTo(100, 3);

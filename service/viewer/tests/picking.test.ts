@@ -25,7 +25,7 @@ test("a ray from above meets the roof of the building beneath it", () => {
   const batches = houses(5);
   for (let i = 0; i < 5; i++) {
     const hit = pick(batches, ray([20 * i, 1, 100], [0, 0, -1]));
-    expect(hit?.batch.ids[hit.index]).toBe(`house ${i}`);
+    expect(hit?.batch.listed[hit.index].id).toBe(`house ${i}`);
     expect(hit?.distance).toBeCloseTo(100 - (5 - 2 / 3), 5);
   }
 });
@@ -45,7 +45,7 @@ test("a ray through the box but beside the gable meets nothing", () => {
 
 test("a batch knows where each building begins and ends", () => {
   const [batch] = houses(3);
-  expect(batch.ids).toHaveLength(3);
+  expect(batch.listed).toHaveLength(3);
   expect(batch.starts[3]).toBe(batch.positions.length / 3);
   expect(batch.edgeStarts[3]).toBe(batch.edges.length / 3);
   expect([...batch.boxes.slice(6, 12)]).toEqual([15, -3, 0, 25, 3, 5]);

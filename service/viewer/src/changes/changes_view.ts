@@ -323,8 +323,8 @@ function shiftOf(left: Loaded, right: Loaded): [number, number, number] {
 
 function placed({ objects, batches }: Loaded, [x, y]: readonly number[]): Placed[] {
   const plans = new Map<string, [number, number, number, number]>();
-  for (const { ids, boxes } of batches) {
-    ids.forEach((id, n) => {
+  for (const { listed, boxes } of batches) {
+    listed.forEach(({ id }, n) => {
       const [west, south, , east, north] = boxes.subarray(6 * n, 6 * n + 6);
       plans.set(id, [west + (x ?? 0), south + (y ?? 0), east + (x ?? 0), north + (y ?? 0)]);
     });

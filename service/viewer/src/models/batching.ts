@@ -19,7 +19,6 @@ export interface Listed {
 /** Buildings of one category, merged into one set of triangles. */
 export interface Batch {
   category: Category;
-  ids: string[];
   /** The buildings, as they are listed. */
   listed: Listed[];
   /** Corner at which each building begins, and the number of corners after the last. */
@@ -103,7 +102,6 @@ function merged(category: Category, all: readonly Meshed[]): Batch {
   const corners = starts[n];
   const batch: Batch = {
     category,
-    ids: all.map(({ listed }) => listed.id),
     listed: all.map(({ listed }) => listed),
     starts,
     edgeStarts,

@@ -89,7 +89,7 @@ export class Camera {
   /** Move on by a frame. */
   update(now: number): void {
     if (this.flight !== null) this.fly(now);
-    else this.navigation.update();
+    else this.navigation.controls.update(); // a step of damped movements
     if (this.onMove === null || this.words() === this.known) return;
     this.known = this.words();
     this.onMove(this.view.position, this.navigation.target);

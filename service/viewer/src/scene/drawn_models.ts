@@ -70,7 +70,7 @@ export class DrawnModels {
       this.showIn(drawn);
       this.object.add(mesh, drawn.edges);
       this.drawn.push(drawn);
-      batch.ids.forEach((id, index) => {
+      batch.listed.forEach(({ id }, index) => {
         this.places.set(id, { drawn, index });
         this.bounds.union(boxOf(batch, index));
       });
@@ -174,13 +174,13 @@ export class DrawnModels {
   }
 
   private all<T>(of: (batch: Batch, index: number) => T): T[] {
-    return this.drawn.flatMap(({ batch }) => batch.ids.map((_, index) => of(batch, index)));
+    return this.drawn.flatMap(({ batch }) => batch.listed.map((_, index) => of(batch, index)));
   }
 
   /** Draw the shown buildings of a batch only. */
   private showIn({ batch, mesh, edges }: Drawn): void {
     const { only } = this;
-    const shown = only === null ? undefined : Uint8Array.from(batch.ids, (id) => (only.has(id) ? 1 : 0));
+    const shown = only === null ? undefined : Uint8Array.from(batch.listed, ({ id }) => (only.has(id) ? 1 : 0));
     batch.shown = shown;
     mesh.visible = edges.visible = shown?.includes(1) ?? true;
     drawOnly(mesh.geometry, batch.starts, shown);

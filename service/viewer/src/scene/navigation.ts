@@ -90,11 +90,6 @@ export class Navigation {
     this.settle();
   }
 
-  /** A step of damped movements, once per frame. */
-  update(): void {
-    this.controls.update();
-  }
-
   /**
    * Nearer to the surface at a place of the view (above 1) or farther from it.
    *

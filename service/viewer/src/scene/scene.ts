@@ -6,7 +6,7 @@ import { Camera, TAN_HALF_FOV } from "./camera";
 import { DrawnGround } from "./drawn_ground";
 import { DrawnModels } from "./drawn_models";
 import { groundThrough, type Ground } from "./ground";
-import type { Layer, Tool } from "./layer";
+import type { Layer } from "./layer";
 import { Light } from "./light";
 import type { Surfaces } from "./navigation";
 import { boxDistance } from "./picking";
@@ -27,7 +27,7 @@ export class ModelScene {
   readonly models = new DrawnModels(() => this.settle());
   private readonly ground = new DrawnGround();
   readonly camera: Camera;
-  private readonly pointing: Pointing;
+  readonly pointing: Pointing;
   private readonly layers = new Set<Layer>();
   private readonly watch: ResizeObserver;
   private readonly dark = matchMedia("(prefers-color-scheme: dark)");
@@ -106,11 +106,6 @@ export class ModelScene {
   showGround(visible: boolean): void {
     this.ground.object.visible = visible;
     this.request();
-  }
-
-  /** Let a tool take the clicks, or null for the selection of buildings. */
-  use(tool: Tool | null): void {
-    this.pointing.use(tool);
   }
 
   /** Draw a layer from now on. */
@@ -217,7 +212,7 @@ export class ModelScene {
   /** The building that is seen at a place of the page. */
   buildingAt(clientX: number, clientY: number): string | null {
     const hit = this.models.first(this.ray(clientX, clientY));
-    return hit?.batch.ids[hit.index] ?? null;
+    return hit?.batch.listed[hit.index]?.id ?? null;
   }
 
   /** The place that is seen at a place of the page: a point, a model (its corner if that is near) or the ground. */

@@ -36,7 +36,7 @@ export class MeasureTool implements Tool {
     if (!this.on) return;
     this.on = false;
     this.places = [];
-    this.scene.use(null);
+    this.scene.pointing.use(null);
     this.scene.removeLayer(this.drawing);
     document.removeEventListener("keydown", this.escaped, true);
     setPressed(this.button, false);
@@ -78,7 +78,7 @@ export class MeasureTool implements Tool {
   private begin(): void {
     this.on = true;
     this.at = [0.5, 0.5];
-    this.scene.use(this);
+    this.scene.pointing.use(this);
     this.scene.addLayer(this.drawing);
     document.addEventListener("keydown", this.escaped, true);
     setPressed(this.button, true);
