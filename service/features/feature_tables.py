@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import pyarrow as pa
@@ -60,11 +60,11 @@ class Layer:
         """The kinds of these properties: text, number, boolean, time or list."""
         return {name: kind_of(kind) for name, kind in self.properties.items()}
 
-    def feature_id(self, row: Mapping[str, Any]) -> str:
-        """The id of a row's feature: that of the object; a plane has its building's, a dot and its own number."""
+    def feature_ids(self, columns: Mapping[str, Sequence[Any]]) -> Sequence[str]:
+        """The ids of features: those of the objects; a plane has its building's, a dot and its own number."""
         if self.table == "planes":
-            return f"{row['building_id']}.{row['plane_id']}"
-        return str(row["object_id" if self.table == "rejected" else "building_id"])
+            return list(map("{}.{}".format, columns["building_id"], columns["plane_id"]))
+        return columns["object_id" if self.table == "rejected" else "building_id"]
 
     def filter_schema(self, crs: RunCrs) -> dict[str, Any]:
         """The JSON schemas of the properties that filters can name, and of the geometry."""

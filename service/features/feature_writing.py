@@ -7,7 +7,7 @@ import errno
 import json
 import shutil
 import sqlite3
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Self
 
@@ -23,7 +23,7 @@ from pipeline.runtime.manifest import RunManifest
 from service.features.feature_crs import RunCrs
 from service.features.feature_tables import GEOMETRY, LAYERS, TILE, Layer
 from service.features.index import CRS84, TABLES, TIMES, stamp
-from service.features.pages import from_wkb, geojson
+from service.features.pages import from_wkb
 
 _READERS = 8
 """Tiles that are read at once: files of an object store take long to arrive."""
@@ -106,32 +106,34 @@ class IndexWriter:
             self.connection.executemany("INSERT INTO fact VALUES (?,?)", entries)
         self.connection.execute("BEGIN")
 
-    def add(self, table: str, tile: str, rows: Sequence[Mapping[str, Any]]) -> None:
+    def add(self, table: str, tile: str, rows: pa.Table) -> None:
         """Append rows of a table, all of one tile, with their geometries as WKB."""
-        if not rows:
+        if not len(rows):
             return
         layer = LAYERS[table]
         last = "SELECT coalesce(max(first + n), 0), count(*) FROM part WHERE collection = ?"
         first, number = self.connection.execute(last, (table,)).fetchone()
-        shapes = from_wkb([row[GEOMETRY] for row in rows])
+        geometries = rows[GEOMETRY].to_numpy().tolist()
+        shapes = from_wkb(geometries)
         bounds = shapely.bounds(shapes)
         more: list[list[Any]] = []
         if table == "buildings":
-            degrees = (
-                self.crs.written(shapes, self.crs.named(CRS84, "crs"))
-                if self.crs.is_known
-                else np.full(len(shapes), None)
-            )
+            degrees = np.full(len(shapes), None)
+            if self.crs.is_known:
+                degrees = self.crs.written(shapes, self.crs.named(CRS84, "crs"))
             more += [column.tolist() for column in np.hstack([bounds, shapely.bounds(degrees)]).T]
-            more.append([None if shape is None else geojson(shape) for shape in degrees])
-        more += [_stored(kind, name, tile, rows) for name, kind in layer.kinds.items()]
-        ids = [layer.feature_id(row) for row in rows]
-        stored = zip(range(first, first + len(rows)), ids, (row[GEOMETRY] for row in rows), *more, strict=True)
-        places = ",".join("?" * (3 + len(more)))
+            more.append(shapely.to_geojson(degrees).tolist())
+        own = {name: [None] * len(rows) for name in layer.kinds} | {TILE: [tile] * len(rows)}
+        for name, column in zip(rows.column_names, rows.columns, strict=True):
+            if name in own and name != TILE:  # an older run lacks some
+                own[name] = _stored(layer.kinds[name], column)
+        positions = range(first, first + len(rows))
+        stored = zip(positions, layer.feature_ids(own), geometries, *more, *own.values(), strict=True)
+        places = ",".join("?" * (3 + len(more) + len(own)))
         self.connection.executemany(f"INSERT INTO {table} VALUES ({places})", stored)  # noqa: S608 - our own words
         located = int(np.isfinite(bounds[:, 0]).sum())
         box = (*np.nanmin(bounds[:, :2], 0).tolist(), *np.nanmax(bounds[:, 2:], 0).tolist()) if located else (None,) * 4
-        begins, ends = ([stamp(row[name]) for row in rows if row.get(name) is not None] for name in TIMES)
+        begins, ends = ([at for at in own.get(name, ()) if at is not None] for name in TIMES)
         part = (table, number, first, len(rows), located, *box, min(begins, default=None), max(ends, default=None))
         self.connection.execute("INSERT INTO part VALUES (?,?,?,?,?,?,?,?,?,?,?)", part)
 
@@ -154,14 +156,16 @@ class IndexWriter:
             raise OSError(number, f"the index cannot be written ({error})") from error
 
 
-def _stored(kind: str, name: str, tile: str, rows: Sequence[Mapping[str, Any]]) -> list[Any]:
-    """The values of a column as they are stored; one that an older run lacks is null."""
-    if name == TILE:
-        return [tile] * len(rows)
-    values = [row.get(name) for row in rows]
-    if kind in {"time", "list"}:
-        write = stamp if kind == "time" else json.dumps
-        return [None if value is None else write(value) for value in values]
+def _stored(kind: str, column: pa.ChunkedArray) -> list[Any]:
+    """The values of a column as they are stored; SQLite takes nan for null."""
+    if kind == "time":
+        # few times are different
+        times = column.combine_chunks().dictionary_encode()
+        words = np.array([*map(stamp, times.dictionary.to_pylist()), None], dtype=object)
+        return words[times.indices.fill_null(len(words) - 1).to_numpy()].tolist()
+    values: list[Any] = column.to_numpy().tolist()
+    if kind == "list":
+        return [None if value is None else json.dumps(value.tolist()) if len(value) else "[]" for value in values]
     return values
 
 
@@ -244,7 +248,7 @@ def write_index(
         if tiles is not None:
             for tile in tiles:
                 for table, name, rows in read(tile):
-                    writer.add(table, name, rows.to_pylist())
+                    writer.add(table, name, rows)
             return
         files = table_files(place, "buildings", filesystem)
         found = in_z_order(file.split("/")[-2].removeprefix("tile=") for file in files)
@@ -252,7 +256,7 @@ def write_index(
             for start in range(0, len(found), _READERS):
                 for entries in readers.map(read, found[start : start + _READERS]):
                     for table, name, rows in entries:
-                        writer.add(table, name, rows.to_pylist())
+                        writer.add(table, name, rows)
 
 
 def _rows(filesystem: pafs.FileSystem, place: str, table: str, tile: str) -> pa.Table:
@@ -260,7 +264,8 @@ def _rows(filesystem: pafs.FileSystem, place: str, table: str, tile: str) -> pa.
     (file,) = table_files(place, table, filesystem, [tile])
     try:
         with filesystem.open_input_file(file) as stream, pq.ParquetFile(stream) as stored:
-            names = [name for name in (GEOMETRY, *LAYERS[table].properties) if name in stored.schema_arrow.names]
+            there = set(stored.schema_arrow.names)
+            names = [name for name in (GEOMETRY, *LAYERS[table].properties) if name in there]
             return stored.read(columns=names, use_threads=False)
     except (OSError, pa.ArrowException) as error:
         raise RunError(f"{file} cannot be read as Parquet: {error}") from error

@@ -14,8 +14,10 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Self
 
+import pyarrow as pa
+
 from pipeline.export.facts import RecordContext
-from pipeline.export.record_rows import plane_rows
+from pipeline.export.record_rows import SCHEMAS, plane_rows
 from pipeline.export.tile import building_rows, city_lines
 from pipeline.runtime.stages.model_batch import StoredResult
 from service.features.feature_writing import GrowingIndex
@@ -72,8 +74,9 @@ class BuildingsSoFar:
             place = (json.loads(line)["id"], self._city.tell(), len(text))
             self._index.connection.execute("INSERT INTO city VALUES (?,?,?)", place)
             self._city.write(text)
-        self._index.add("buildings", tile, rows)
-        self._index.add("planes", tile, [row for result in results for row in plane_rows(result, context)])
+        planes = [row for result in results for row in plane_rows(result, context)]
+        for table, found in (("buildings", rows), ("planes", planes)):
+            self._index.add(table, tile, pa.Table.from_pylist(found, SCHEMAS[table]))
         self._index.connection.execute("INSERT INTO batch VALUES (?)", (batch,))
         self.batches.add(batch)
 
