@@ -162,7 +162,7 @@ def _stored(kind: str, column: pa.ChunkedArray) -> list[Any]:
         # few times are different
         times = column.combine_chunks().dictionary_encode()
         words = np.array([*map(stamp, times.dictionary.to_pylist()), None], dtype=object)
-        return words[times.indices.fill_null(len(words) - 1).to_numpy()].tolist()
+        return list(words[times.indices.fill_null(len(words) - 1).to_numpy()])
     values: list[Any] = column.to_numpy().tolist()
     if kind == "list":
         return [None if value is None else json.dumps(value.tolist()) if len(value) else "[]" for value in values]
