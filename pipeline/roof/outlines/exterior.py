@@ -27,7 +27,7 @@ from pipeline.roof.outlines.description import FREE, Prices, least_description
 from pipeline.roof.roof_settings import RoofSettings
 from pipeline.roof.snapped_rings import differ_by_more, on_grid, snapped_ring
 
-PRICES = Prices(edge=3.0, free=8.0, change=3.0, jog=9.0, sharp=60.0, flat=60.0)
+PRICES = Prices(edge=4.0, free=8.0, change=3.0, sharp=60.0, flat=60.0)
 """What is saved must be worth it: at these prices a step of a wall is drawn that is as deep as the points show well."""
 _FREE_ALONE = 1.0
 """The price of a direction of its own while no common direction is known."""
@@ -41,6 +41,8 @@ _BREAK_SPACINGS = 0.45
 """Edges end at vertices that are this far apart at least."""
 _FACTORS = (1.0, 0.6, 0.35)
 """Times the noise: an outline that cannot be drawn with few edges is tried with more."""
+_FEWEST, _FEW_BREAKS = 4, 60
+"""A ring of so few breaks has four edges at least."""
 _APART = math.radians(8.0)
 """Two pairs of common directions differ by more."""
 _ABOUT = math.radians(12.0)
@@ -118,11 +120,12 @@ def _straight_rings(
         rings = [_with_breaks(border, _BREAK_SPACINGS * spacing_m * 1e3) for border in borders]
         for k, (border, runs) in enumerate(described(rings, spacing_m * 1e3, noise_mm)):
             if drawn[k] is None and len(runs) > 2:
-                if points is not None:
-                    _take_positions(border, runs, points, reach_mm)
                 least = max(_LEAST_SPACINGS * spacing_m, _LEAST_M) * 1e3
-                places = corners(border, without_short(border, runs, least), math.inf, closed=True)
-                drawn[k] = _accepted(border, places, factor * tolerance)
+                drawn[k] = _ring_of(border, runs, least, tolerance)
+                if drawn[k] is not None and points is not None:
+                    _take_positions(border, runs, points, reach_mm)
+                    moved = _ring_of(border, runs, least, tolerance + 2.5 * points.spacing_mm)
+                    drawn[k] = drawn[k] if moved is None else moved
         if all(ring is not None for ring in drawn):
             break
     return [raw if ring is None else ring for raw, ring in zip(borders, drawn, strict=True)]
@@ -157,6 +160,11 @@ def described(rings: Sequence[_Ring], spacing_mm: float, noise_mm: float) -> lis
         if better is None or better[0] >= least:
             break
         least, systems, best = better
+    for k, ring in enumerate(rings):
+        if len(best[k]) < _FEWEST and len(ring.breaks) <= _FEW_BREAKS:
+            # a few points never show a triangle: it is the cheapest way to cut the corners of a rectangle
+            longest = max(best[k], key=lambda run: run.length).direction if best[k] else 0.0
+            best[k] = _runs(ring, pairs_of([longest]), per_mm, PRICES._replace(free=PRICES.sharp))[0]
     return [(ring.border, own) for ring, own in zip(rings, best, strict=True)]
 
 
@@ -340,8 +348,10 @@ def _turned(ring: FloatArray, is_hole: bool) -> FloatArray:
     return np.concatenate((turned[start:], turned[:start]))
 
 
-def _accepted(ring: FloatArray, places: Sequence[Point], tolerance: float) -> FloatArray | None:
-    """The corners as a ring where they make a sound one near the raw ring; small loops at corners are cut off."""
+def _ring_of(border: FloatArray, runs: Sequence[Run], least_mm: float, tolerance: float) -> FloatArray | None:
+    """A sound ring through the corners of edges, if it lies near the raw one; small loops at corners are cut off."""
+    copies = [dataclasses.replace(run) for run in runs]
+    places = corners(border, without_short(border, copies, least_mm), math.inf, closed=True)
     if len(places) < 3:
         return None
     drawn = snapped_ring(np.array(places))
@@ -351,4 +361,4 @@ def _accepted(ring: FloatArray, places: Sequence[Point], tolerance: float) -> Fl
         if not parts:
             return None
         drawn = shapely.get_coordinates(max(parts, key=lambda part: part.area).exterior)[:-1]
-    return None if differ_by_more(drawn, ring, _MOVED * tolerance * Polygon(ring).length) else drawn
+    return None if differ_by_more(drawn, border, _MOVED * tolerance * Polygon(border).length) else drawn
