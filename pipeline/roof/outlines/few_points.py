@@ -17,13 +17,13 @@ from shapely import Polygon
 from pipeline.model import FloatArray
 from pipeline.roof.lines import Run
 
-MOST_POINTS = 300
+MOST_POINTS = 150
 """More points show directions well."""
-_LEAST_SPACING_M = 0.6
+_LEAST_SPACING_M = 1.0
 """As do points that lie closer."""
-_OFF_MM = 250.0
+_OFF_MM = 120.0
 """Standard deviation of a point about the edge that it lies outside of."""
-_MOST = 6.0
+_MOST = 8.0
 """Most that a point outside costs, nats: it may be no roof."""
 _STEP = math.radians(5.0)
 """Between the directions that are tried."""
