@@ -1,0 +1,426 @@
+"""Form of outlines: how regular they are, and how found ones agree with drawn ones.
+
+Regularity needs no reference: a surveyor draws few directions, right angles and no short edges. Beside drawn outlines
+the same figures of these show how much of that is in the place itself.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import shapely
+from scipy.spatial import KDTree
+
+from pipeline.kernels.union_find import united
+from pipeline.model import FloatArray, IntArray
+from pipeline.ruler.evaluation.bootstrap import Share, Sums, quantile, ratio, share
+from pipeline.ruler.evaluation.building_matching import (
+    MIN_IOU,
+    MIN_SHARE,
+    Geometries,
+    mostly_on,
+    overlapping,
+    sound_polygons,
+    summed,
+)
+from pipeline.ruler.evaluation.measure import Better, Definition, Measure, defined
+from pipeline.ruler.evaluation.models import RoofModel
+from pipeline.ruler.evaluation.outline_edges import (
+    ALONG_DEG,
+    STRAIGHT_M,
+    directions,
+    edges_of,
+    is_near,
+    main_direction,
+    off,
+    ring_of,
+    turns,
+    united_blocks,
+)
+from pipeline.ruler.evaluation.subsets import MODELS_ALONE, Columns, measured, measured_all, measured_median, total
+from pipeline.ruler.evaluation.wireframe_network import roof_segments, split, welded
+from pipeline.ruler.evaluation.wireframe_scores import matched_corners, sampled, tolerance_name
+
+SHORT_M = 1.0
+"""Shorter edges are short."""
+RIGHT_DEG = 7.0
+"""A right corner differs from 90 degrees by at most this angle."""
+ACUTE_DEG = 45.0
+"""An inner corner below it is acute."""
+TOLERANCES_M = (1.0, 0.5)
+"""Distances in plan up to which corners of blocks are one."""
+MIN_TURN_DEG = 10.0
+"""A corner of a block turns by more."""
+STEP_M = 0.2
+"""Two faces of one model have a step between them from this difference of heights on, in the middle of the edge."""
+MIN_OBLIQUE_M, MIN_OBLIQUE_DEG = 3.0, 12.0
+"""A drawn edge of this length that is farther off both directions of its block is oblique."""
+NEAR_M = 1.0
+"""An oblique edge is found where a model has an edge of its direction within this distance."""
+_STRAIGHT_CORNER_M = 0.1
+"""As `STRAIGHT_M`, for corners of blocks."""
+_SPACING_M = 0.2
+"""Spacing of the places on outlines."""
+AWAY_M: FloatArray = np.concatenate(([0.0, 1e-6], np.arange(1, 500) * 0.01, np.arange(50, 500) * 0.1, [1e5]))
+"""Borders of the bins of distances: 1 cm up to 5 m, 10 cm up to 50 m, and all beyond."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FormScore:
+    """The form of outlines, as columns."""
+
+    found: Columns
+    """Of each model, summed over its outlines: `outlines`, `corners`, `length_m`, `along_m` in two directions, `right`
+    corners, `short` edges, `acute` outlines, `triangles`."""
+    drawn: Columns
+    """The same of the drawn outlines; empty without any."""
+    inner: Columns
+    """Of each block of models, steps and common walls: `length_m`, `along_m` in its two directions, `short` pieces."""
+    blocks: Columns
+    """Of each drawn block: `x` and `y` of its middle; `compared`: whether a block of models stands there, and if so
+    `iou`, `found` and `drawn` corners, `right_1m` and `right_0_5m` pairs of them, `away`: numbers of places on the
+    found outline by their distance to the drawn one, in the bins of `AWAY_M`; `oblique_m` and `oblique_found_m` of
+    drawn edges. Empty without drawn outlines."""
+
+
+def score_form(models: Sequence[RoofModel], drawn: Sequence[shapely.Geometry] = ()) -> FormScore:
+    """The form of the outlines of models, and of drawn ones if there are any."""
+    made = sound_polygons([model.footprint for model in models])
+    blocks = united_blocks(made)
+    return FormScore(
+        found=_regularity(made),
+        drawn=_regularity(sound_polygons(drawn)) if len(drawn) else {},
+        inner=_inner_edges(models, blocks, mostly_on(len(made), overlapping(blocks, made))),
+        blocks=_beside_drawn(made, blocks, united_blocks(drawn)) if len(drawn) else {},
+    )
+
+
+# ----------------------------------------------------------------------------------------------------------- regularity
+
+_REGULARITY = ("outlines", "corners", "length_m", "along_m", "right", "short", "acute", "triangles")
+
+
+def _regularity(outlines: Geometries) -> Columns:
+    """The columns of `FormScore.found`, a row per (multi)polygon."""
+    parts, owner = shapely.get_parts(outlines, return_index=True)
+    rows = np.array([_regularity_of(ring_of(part)) for part in parts], np.float64).reshape(-1, len(_REGULARITY))
+    return {name: summed(owner, rows[:, k], len(outlines)) for k, name in enumerate(_REGULARITY)}
+
+
+def _regularity_of(ring: FloatArray) -> tuple[float, ...]:
+    """The figures of one outline, in the order of `_REGULARITY`."""
+    if len(ring) < 3:
+        return (0.0,) * len(_REGULARITY)
+    units, length, direction = edges_of(ring)
+    follows = off(direction, main_direction(direction, length)) <= ALONG_DEG
+    turn = turns(units)
+    return (
+        1.0,
+        len(ring),
+        length.sum(),
+        length[follows].sum(),
+        (np.abs(turn - 90.0) <= RIGHT_DEG).sum(),
+        (length < SHORT_M).sum(),
+        float((turn > 180.0 - ACUTE_DEG).any()),
+        float(len(ring) == 3),
+    )
+
+
+# ---------------------------------------------------------------------------------------------- steps and common walls
+
+
+def _inner_edges(models: Sequence[RoofModel], blocks: Geometries, block: IntArray) -> Columns:
+    """The columns of `FormScore.inner`, (b,)."""
+    rows = np.zeros((len(blocks), 3))
+    order = np.argsort(block, kind="stable")
+    ends = np.searchsorted(block[order], np.arange(len(blocks) + 1))
+    for k, (first, last) in enumerate(zip(ends[:-1].tolist(), ends[1:].tolist(), strict=True)):
+        lines = _inner_lines([models[m] for m in order[first:last].tolist()])
+        if len(lines):
+            _, length_m, direction = edges_of(ring_of(blocks[k]))
+            along = lines[:, 1] - lines[:, 0]
+            metres = np.hypot(along[:, 0], along[:, 1])
+            follows = off(directions(along), main_direction(direction, length_m)) <= ALONG_DEG
+            piece = _straight_pieces(lines)
+            whole = np.bincount(piece, weights=metres)
+            rows[k] = metres.sum(), metres[follows].sum(), (whole[np.unique(piece)] < SHORT_M).sum()
+    return {"length_m": rows[:, 0], "along_m": rows[:, 1], "short": rows[:, 2]}
+
+
+def _inner_lines(models: Sequence[RoofModel]) -> FloatArray:
+    """Steps and common walls of the models of a block as straight lines between junctions, (n, 2, 2)."""
+    segments = roof_segments(models, range(len(models)))
+    vertices, ends = welded(segments.ends[:, :, :2].reshape(-1, 2))
+    pieces, source = split(vertices, ends.reshape(-1, 2))
+    real = pieces[:, 0] != pieces[:, 1]
+    pieces, source = pieces[real], source[real]
+    low, high = segments.ends[source, 0], segments.ends[source, 1]
+    along = (high - low)[:, :2]
+    middle = vertices[pieces].mean(axis=1) - low[:, :2]
+    share_of = (middle * along).sum(axis=1) / np.maximum((along**2).sum(axis=1), 1e-12)
+    height = low[:, 2] + share_of * (high - low)[:, 2]
+    unique, stretch = np.unique(np.sort(pieces, axis=1), axis=0, return_inverse=True)
+    stretch, count = stretch.ravel(), len(unique)
+
+    def spread(values: FloatArray) -> FloatArray:
+        most, least = np.full(count, -np.inf), np.full(count, np.inf)
+        np.maximum.at(most, stretch, values)
+        np.minimum.at(least, stretch, values)
+        return most - least
+
+    inner = (spread(segments.owner[source].astype(np.float64)) > 0.0) | (spread(height) > STEP_M)
+    chains = shapely.get_parts(shapely.line_merge(shapely.multilinestrings(vertices[unique[inner]])))
+    corners, chain = shapely.get_coordinates(shapely.simplify(chains, STRAIGHT_M), return_index=True)
+    follows = chain[1:] == chain[:-1]
+    return np.stack([corners[:-1][follows], corners[1:][follows]], axis=1)
+
+
+def _straight_pieces(lines: FloatArray) -> IntArray:
+    """The piece of each line, (n,): at a junction the two lines that go straight on, within `STRAIGHT_M`, are one."""
+    vertices, ends = welded(lines.reshape(-1, 2))
+    pairs = []
+    for junction in range(len(vertices)):
+        at = np.flatnonzero(ends == junction)
+        towards = vertices[ends[at ^ 1]] - vertices[junction]
+        a, b = np.triu_indices(len(at), 1)
+        chord = towards[b] - towards[a]
+        away = np.abs(towards[a][:, 0] * towards[b][:, 1] - towards[a][:, 1] * towards[b][:, 0])
+        away /= np.maximum(np.hypot(chord[:, 0], chord[:, 1]), 1e-9)
+        away[(towards[a] * towards[b]).sum(axis=1) >= 0.0] = np.inf
+        free = set(range(len(at)))
+        for k in np.argsort(away, kind="stable").tolist():
+            if away[k] <= STRAIGHT_M and {a[k], b[k]} <= free:
+                free -= {a[k], b[k]}
+                pairs.append((at[a[k]] // 2, at[b[k]] // 2))
+    return united(len(lines), *np.array(pairs, np.int64).reshape(-1, 2).T)
+
+
+# ------------------------------------------------------------------------------------------------ beside drawn outlines
+
+
+def _beside_drawn(made: Geometries, found: Geometries, drawn: Geometries) -> Columns:
+    """The columns of `FormScore.blocks`, a row per drawn block.
+
+    A block of models stands for the drawn one that holds more than half of it; of several the one with most of it, if
+    their IoU is at least one half.
+    """
+    count = len(drawn)
+    pairs = overlapping(drawn, found)
+    found_m2, drawn_m2 = shapely.area(found), shapely.area(drawn)
+    inside = np.flatnonzero(pairs.common_m2 > MIN_SHARE * found_m2[pairs.second])
+    best = inside[np.argsort(pairs.common_m2[inside], kind="stable")]
+    iou, partner = np.zeros(count), np.full(count, -1, np.int64)
+    partner[pairs.first[best]] = pairs.second[best]
+    common = np.zeros(count)
+    common[pairs.first[best]] = pairs.common_m2[best]
+    iou = common / (drawn_m2 + np.append(found_m2, 0.0)[partner] - common)
+    middles = shapely.centroid(drawn)
+    names = ("found", "drawn", *(f"right_{tolerance_name(tolerance)}" for tolerance in TOLERANCES_M))
+    columns: Columns = {"x": shapely.get_x(middles), "y": shapely.get_y(middles), "iou": iou}
+    columns |= {"compared": (iou >= MIN_IOU).astype(np.float64), **{name: np.zeros(count) for name in names}}
+    columns |= {"away": np.zeros((count, len(AWAY_M) - 1)), "oblique_m": np.zeros(count)}
+    columns["oblique_found_m"] = np.zeros(count)
+    rings = [shapely.get_coordinates(ring) for ring in shapely.get_rings(made)]
+    edges = np.concatenate([np.zeros((0, 2, 2)), *(np.stack([ring[:-1], ring[1:]], axis=1) for ring in rings)])
+    for k in np.flatnonzero(columns["compared"]).tolist():
+        one, other = _block_corners(found[partner[k]]), _block_corners(drawn[k])
+        right = [matched_corners(other, one, tolerance)[0].sum() for tolerance in TOLERANCES_M]
+        for name, value in zip(names, (len(one), len(other), *right), strict=True):
+            columns[name][k] = value
+        away, _ = KDTree(_places_along(drawn[k])).query(_places_along(found[partner[k]]))
+        columns["away"][k] = np.histogram(away, AWAY_M)[0]
+        columns["oblique_m"][k], columns["oblique_found_m"][k] = _oblique(drawn[k], edges)
+    return columns
+
+
+def _block_corners(block: shapely.Geometry) -> FloatArray:
+    """Corners of the exterior of a block, (k, 2)."""
+    ring = ring_of(block, _STRAIGHT_CORNER_M)
+    return ring[turns(edges_of(ring)[0]) > MIN_TURN_DEG]
+
+
+def _places_along(block: shapely.Geometry) -> FloatArray:
+    """Places on the exterior of a block, (s, 2)."""
+    ring = shapely.get_exterior_ring(block)
+    return shapely.get_coordinates(shapely.line_interpolate_point(ring, np.arange(0.0, ring.length, _SPACING_M)))
+
+
+def _oblique(block: shapely.Geometry, edges: FloatArray) -> tuple[float, float]:
+    """Metres of the oblique edges of a drawn block, and of their parts where one of the edges (e, 2, 2) runs along."""
+    ring = ring_of(block)
+    _, length, direction = edges_of(ring)
+    oblique = (length >= MIN_OBLIQUE_M) & (off(direction, main_direction(direction, length)) > MIN_OBLIQUE_DEG)
+    along = np.stack([ring, np.roll(ring, -1, axis=0)], axis=1)[oblique]
+    places, metres, edge = sampled(along, _SPACING_M)
+    towards = along[:, 1] - along[:, 0]
+    heading = np.degrees(np.arctan2(towards[:, 1], towards[:, 0]))
+    return float(metres.sum()), float(metres[is_near(places, heading[edge], edges, NEAR_M)].sum())
+
+
+# -------------------------------------------------------------------------------------------------------------- figures
+
+
+def _f1(sums: Sums) -> FloatArray:
+    return 2.0 * sums["right"] / (sums["found"] + sums["drawn"])
+
+
+def measures(score: FormScore) -> list[Measure]:
+    """The figures; models, drawn outlines and blocks are resampled."""
+    figures = [*_regular("", score.found)]
+    inner = {name: column[score.inner["length_m"] > 0.0] for name, column in score.inner.items()}
+    if len(inner["length_m"]):
+        figures += measured_all(
+            inner,
+            MODELS_ALONE,
+            [
+                ("form.inner_short_edges", _per_100m, inner["length_m"].sum()),
+                ("form.inner_two_directions", share("along_m", "length_m"), inner["length_m"].sum()),
+            ],
+        )
+    if not score.drawn:
+        return figures
+    figures += _regular("drawn_", score.drawn)
+    blocks, all_blocks = score.blocks, len(score.blocks["iou"])
+    figures.append(measured("form.blocks", blocks, total("compared"), n=all_blocks, subset=MODELS_ALONE))
+    blocks = {name: column[blocks["compared"] > 0.0] for name, column in blocks.items()}
+    figures.append(measured_median("form.block_iou_median", blocks["iou"], MODELS_ALONE))
+    if not len(blocks["iou"]):
+        return figures
+    found, drawn = blocks["found"].sum(), blocks["drawn"].sum()
+    for tolerance in TOLERANCES_M:
+        at = tolerance_name(tolerance)
+        corners = {"right": blocks[f"right_{at}"], "found": blocks["found"], "drawn": blocks["drawn"]}
+        statistics = (
+            (f"form.corner_precision_{at}", share("right", "found"), found),
+            (f"form.corner_recall_{at}", share("right", "drawn"), drawn),
+            (f"form.corner_f1_{at}", Share(figure=_f1, denominator="drawn"), found + drawn),
+        )
+        figures += measured_all(corners, MODELS_ALONE, statistics)
+    n = blocks["away"].sum()
+    figures += measured_all(
+        blocks,
+        MODELS_ALONE,
+        [
+            ("form.outline_distance_median", quantile("away", AWAY_M, 0.5), n),
+            ("form.outline_distance_p90", quantile("away", AWAY_M, 0.9), n),
+            ("form.oblique_found", share("oblique_found_m", "oblique_m"), blocks["oblique_m"].sum()),
+        ],
+    )
+    return figures
+
+
+def _per_100m(sums: Sums) -> FloatArray:
+    return 100.0 * ratio("short", "length_m")(sums)
+
+
+def _regular(which: str, columns: Mapping[str, FloatArray]) -> list[Measure]:
+    n = {name: column.sum() for name, column in columns.items()}
+    return measured_all(
+        columns,
+        MODELS_ALONE,
+        [
+            (f"form.{which}two_directions", share("along_m", "length_m"), n["length_m"]),
+            (f"form.{which}right_corners", share("right", "corners"), n["corners"]),
+            (f"form.{which}acute_outlines", share("acute", "outlines"), n["outlines"]),
+            (f"form.{which}short_edges", _per_100m, n["length_m"]),
+            (f"form.{which}triangles", total("triangles"), n["outlines"]),
+            (f"form.{which}corners", ratio("corners", "outlines"), n["outlines"]),
+        ],
+    )
+
+
+_RINGS = f"exteriors of all outlines, corners closer than {100 * STRAIGHT_M:g} cm to a straight edge left out"
+_MAIN = f"within {ALONG_DEG:g} deg of the direction that most of the length shares, or of its perpendicular"
+_BLOCKS = (
+    "blocks: outlines united, gaps under 0.3 m closed; a block of models stands for the drawn one that holds over half "
+    "of it, with an IoU >= 0.5"
+)
+_SIDES = (("", "", ""), ("drawn_", ", drawn", "of the drawn outlines: "))
+_INNER = (
+    "edges in plan that two models of a block share, or two faces of one model whose heights differ by more than "
+    f"{STEP_M:g} m in the middle of the edge"
+)
+
+
+def _definitions_of(which: str, label: str, of: str) -> tuple[Definition, ...]:
+    """The measures of regularity of found or of drawn outlines."""
+    lower = Better.LOWER if not which else Better.NEITHER
+    higher = Better.HIGHER if not which else Better.NEITHER
+    rows = (
+        ("two_directions", "length along two directions", f"share of the length {_MAIN}; {_RINGS}", higher, "share"),
+        ("right_corners", "right corners", f"share of corners within {RIGHT_DEG:g} deg of 90", higher, "share"),
+        (
+            "acute_outlines",
+            f"outlines with a corner under {ACUTE_DEG:g} deg",
+            f"share of outlines with an inner or outer angle under {ACUTE_DEG:g} deg",
+            lower,
+            "share",
+        ),
+        ("short_edges", "short edges per 100 m", f"edges under {SHORT_M:g} m / length, times 100 m", lower, ""),
+        ("triangles", "triangles", "outlines with three corners", lower, "count"),
+        ("corners", "corners per outline", "corners / outlines", Better.NEITHER, ""),
+    )
+    return tuple(
+        defined(f"form.{which}{name}", what + label, of + formula, better, unit)
+        for name, what, formula, better, unit in rows
+    )
+
+
+def _definitions_at(tolerance_m: float) -> tuple[Definition, ...]:
+    """The measures of corners at one tolerance."""
+    at, name = f"{tolerance_m:g} m", tolerance_name(tolerance_m)
+    corners = f"corners of exteriors of blocks that turn by more than {MIN_TURN_DEG:g} deg, one to one within {at}"
+    return (
+        defined(f"form.corner_precision_{name}", f"block corners right, {at}", f"pairs / found corners; {corners}"),
+        defined(f"form.corner_recall_{name}", f"block corners found, {at}", f"pairs / drawn corners; {corners}"),
+        defined(f"form.corner_f1_{name}", f"block corner F1, {at}", "2 pairs / (found + drawn corners)"),
+    )
+
+
+DEFINITIONS = (
+    *_definitions_of(*_SIDES[0]),
+    defined(
+        "form.inner_short_edges",
+        "short steps and common walls per 100 m",
+        f"pieces under {SHORT_M:g} m / length, times 100 m; {_INNER}; merged where collinear within "
+        f"{100 * STRAIGHT_M:g} cm",
+        Better.LOWER,
+        "",
+    ),
+    defined(
+        "form.inner_two_directions",
+        "steps and common walls along two directions",
+        f"share of their length within {ALONG_DEG:g} deg of the two directions of their block; {_INNER}; n in metres",
+    ),
+    *_definitions_of(*_SIDES[1]),
+    defined(
+        "form.blocks",
+        "blocks compared",
+        f"drawn blocks for which models stand; n: all drawn blocks; {_BLOCKS}",
+        Better.HIGHER,
+        "count",
+    ),
+    defined("form.block_iou_median", "IoU of blocks, median", f"median over the blocks compared; {_BLOCKS}"),
+    *(one for tolerance in TOLERANCES_M for one in _definitions_at(tolerance)),
+    *(
+        defined(
+            f"form.outline_distance_{name}",
+            f"distance of outlines, {label}",
+            f"{label} over places every {_SPACING_M:g} m on exteriors of found blocks of the distance to the nearest "
+            "such place on the drawn block",
+            Better.LOWER,
+            "m",
+        )
+        for name, label in (("median", "median"), ("p90", "90 %"))
+    ),
+    defined(
+        "form.oblique_found",
+        "drawn oblique edges found",
+        f"share of the length of drawn edges >= {MIN_OBLIQUE_M:g} m, over {MIN_OBLIQUE_DEG:g} deg off both directions "
+        f"of their block, with an edge of a model within {NEAR_M:g} m and {ALONG_DEG:g} deg, tried every "
+        f"{_SPACING_M:g} m; blocks compared; n in metres",
+    ),
+)
+"""The measures."""
