@@ -270,15 +270,15 @@ def measures(score: FormScore) -> list[Measure]:
     """The figures; models, drawn outlines and blocks are resampled."""
     figures = [*_regular("", score.found)]
     inner = {name: column[score.inner["length_m"] > 0.0] for name, column in score.inner.items()}
-    if len(inner["length_m"]):
-        figures += measured_all(
-            inner,
-            MODELS_ALONE,
-            [
-                ("form.inner_short_edges", _per_100m, inner["length_m"].sum()),
-                ("form.inner_two_directions", share("along_m", "length_m"), inner["length_m"].sum()),
-            ],
-        )
+    metres = inner["length_m"].sum()
+    figures += measured_all(
+        inner,
+        MODELS_ALONE,
+        [
+            ("form.inner_short_edges", _per_100m, metres),
+            ("form.inner_two_directions", share("along_m", "length_m"), metres),
+        ],
+    )
     if not score.drawn:
         return figures
     figures += _regular("drawn_", score.drawn)
@@ -286,8 +286,6 @@ def measures(score: FormScore) -> list[Measure]:
     figures.append(measured("form.blocks", blocks, total("compared"), n=all_blocks, subset=MODELS_ALONE))
     blocks = {name: column[blocks["compared"] > 0.0] for name, column in blocks.items()}
     figures.append(measured_median("form.block_iou_median", blocks["iou"], MODELS_ALONE))
-    if not len(blocks["iou"]):
-        return figures
     found, drawn = blocks["found"].sum(), blocks["drawn"].sum()
     for tolerance in TOLERANCES_M:
         at = tolerance_name(tolerance)
