@@ -87,13 +87,13 @@ class FormScore:
 
 def score_form(models: Sequence[RoofModel], drawn: Sequence[shapely.Geometry] = ()) -> FormScore:
     """The form of the outlines of models, and of drawn ones if there are any."""
-    made = sound_polygons([model.footprint for model in models])
+    made, given = sound_polygons([model.footprint for model in models]), sound_polygons(drawn)
     blocks = united_blocks(made)
     return FormScore(
         found=_regularity(made),
-        drawn=_regularity(sound_polygons(drawn)) if len(drawn) else {},
+        drawn=_regularity(given) if len(drawn) else {},
         inner=_inner_edges(models, blocks, mostly_on(len(made), overlapping(blocks, made))),
-        blocks=_beside_drawn(made, blocks, united_blocks(drawn)) if len(drawn) else {},
+        blocks=_beside_drawn(made, blocks, united_blocks(given)) if len(drawn) else {},
     )
 
 
@@ -165,10 +165,12 @@ def _inner_lines(models: Sequence[RoofModel]) -> FloatArray:
     stretch, count = stretch.ravel(), len(unique)
 
     def spread(values: FloatArray) -> FloatArray:
+        """Largest less smallest value of each stretch."""
         most, least = np.full(count, -np.inf), np.full(count, np.inf)
         np.maximum.at(most, stretch, values)
         np.minimum.at(least, stretch, values)
-        return most - least
+        apart: FloatArray = most - least
+        return apart
 
     inner = (spread(segments.owner[source].astype(np.float64)) > 0.0) | (spread(height) > STEP_M)
     chains = shapely.get_parts(shapely.line_merge(shapely.multilinestrings(vertices[unique[inner]])))
@@ -244,7 +246,9 @@ def _block_corners(block: shapely.Geometry) -> FloatArray:
 def _places_along(block: shapely.Geometry) -> FloatArray:
     """Places on the exterior of a block, (s, 2)."""
     ring = shapely.get_exterior_ring(block)
-    return shapely.get_coordinates(shapely.line_interpolate_point(ring, np.arange(0.0, ring.length, _SPACING_M)))
+    places = shapely.line_interpolate_point(ring, np.arange(0.0, ring.length, _SPACING_M))
+    xy: FloatArray = shapely.get_coordinates(places)
+    return xy
 
 
 def _oblique(block: shapely.Geometry, edges: FloatArray) -> tuple[float, float]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 import shapely
 
@@ -20,7 +18,8 @@ _HALF_GAP_M = 0.15
 
 def ring_of(outline: shapely.Geometry, straight_m: float = STRAIGHT_M) -> FloatArray:
     """The corners of the exterior of a polygon, (k, 2), none on a straight edge; fewer than 3 if it is empty."""
-    return shapely.get_coordinates(shapely.get_exterior_ring(shapely.simplify(outline, straight_m)))[:-1]
+    ring: FloatArray = shapely.get_coordinates(shapely.get_exterior_ring(shapely.simplify(outline, straight_m)))
+    return ring[:-1]
 
 
 def edges_of(ring: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -49,12 +48,13 @@ def main_direction(direction: FloatArray, length: FloatArray) -> float:
 def turns(units: FloatArray) -> FloatArray:
     """By how many degrees each corner turns, (k,), from 0 (straight on) to 180, from the unit vectors of the edges."""
     cosine = (units * np.roll(units, 1, axis=0)).sum(axis=1)
-    return np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    turn: FloatArray = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    return turn
 
 
-def united_blocks(outlines: Sequence[shapely.Geometry]) -> Geometries:
+def united_blocks(outlines: Geometries) -> Geometries:
     """The outlines with gaps of up to 0.3 m closed, united: one polygon for all that touch, (b,)."""
-    wider = shapely.buffer(np.array([*outlines, shapely.Polygon()], object), _HALF_GAP_M, join_style="mitre")
+    wider = shapely.buffer(np.append(outlines, shapely.Polygon()), _HALF_GAP_M, join_style="mitre")
     closed = shapely.buffer(shapely.union_all(wider), -_HALF_GAP_M, join_style="mitre")
     parts = [max(shapely.get_parts(one), key=shapely.area) for one in sound_polygons(shapely.get_parts(closed))]
     blocks = np.empty(len(parts), object)
