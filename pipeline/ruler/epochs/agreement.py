@@ -26,7 +26,7 @@ def check_agreement(old: Epoch, new: Epoch) -> tuple[str, ...]:
     if differing:
         warnings.append(
             f"other {' and '.join(differing)} may draw outlines and roofs anew where nothing was built: areas, volumes "
-            f"and iou hold that, too, and reshaped rows have the doubt {Doubt.OTHER_VERSION.value}. For changes of the "
+            f"and iou show that, too, and reshaped rows have the doubt {Doubt.OTHER_VERSION.value}. For changes of the "
             "place alone run the points of OLD again as NEW was run"
         )
     given = [epoch.manifest.request.get("footprints") is not None for epoch in (old, new)]
