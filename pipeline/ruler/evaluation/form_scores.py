@@ -15,7 +15,7 @@ from scipy.spatial import KDTree
 
 from pipeline.kernels.union_find import united
 from pipeline.model import FloatArray, IntArray
-from pipeline.ruler.evaluation.bootstrap import Share, Sums, quantile, ratio, share
+from pipeline.ruler.evaluation.bootstrap import Share, Statistic, Sums, quantile, ratio, share
 from pipeline.ruler.evaluation.building_matching import (
     MIN_IOU,
     MIN_SHARE,
@@ -77,7 +77,8 @@ class FormScore:
     drawn: Columns
     """The same of the drawn outlines; empty without any."""
     inner: Columns
-    """Of each block of models, steps and common walls: `length_m`, `along_m` in its two directions, `short` pieces."""
+    """Of each block of models: `length_m`, `along_m` in its two directions and `short` pieces, after `wall_` those of
+    its common walls, after `inner_` those of walls and steps."""
     blocks: Columns
     """Of each drawn block: `x` and `y` of its middle; `compared`: whether a block of models stands there, and if so
     `iou`, `found` and `drawn` corners, `right_1m` and `right_0_5m` pairs of them, `away`: numbers of places on the
@@ -130,27 +131,30 @@ def _regularity_of(ring: FloatArray) -> tuple[float, ...]:
 
 # ---------------------------------------------------------------------------------------------- steps and common walls
 
+_KINDS = ("wall", "inner")
+
 
 def _inner_edges(models: Sequence[RoofModel], blocks: Geometries, block: IntArray) -> Columns:
     """The columns of `FormScore.inner`, (b,)."""
-    rows = np.zeros((len(blocks), 3))
+    columns = {f"{kind}_{name}": np.zeros(len(blocks)) for kind in _KINDS for name in ("length_m", "along_m", "short")}
     order = np.argsort(block, kind="stable")
     ends = np.searchsorted(block[order], np.arange(len(blocks) + 1))
     for k, (first, last) in enumerate(zip(ends[:-1].tolist(), ends[1:].tolist(), strict=True)):
-        lines = _inner_lines([models[m] for m in order[first:last].tolist()])
-        if len(lines):
-            _, length_m, direction = edges_of(ring_of(blocks[k]))
-            along = lines[:, 1] - lines[:, 0]
-            metres = np.hypot(along[:, 0], along[:, 1])
-            follows = off(directions(along), main_direction(direction, length_m)) <= ALONG_DEG
-            piece = _straight_pieces(lines)
-            whole = np.bincount(piece, weights=metres)
-            rows[k] = metres.sum(), metres[follows].sum(), (whole[np.unique(piece)] < SHORT_M).sum()
-    return {"length_m": rows[:, 0], "along_m": rows[:, 1], "short": rows[:, 2]}
+        for kind, lines in zip(_KINDS, _inner_lines([models[m] for m in order[first:last].tolist()]), strict=True):
+            if len(lines):
+                _, length_m, direction = edges_of(ring_of(blocks[k]))
+                along = lines[:, 1] - lines[:, 0]
+                metres = np.hypot(along[:, 0], along[:, 1])
+                follows = off(directions(along), main_direction(direction, length_m)) <= ALONG_DEG
+                piece = _straight_pieces(lines)
+                columns[f"{kind}_length_m"][k] = metres.sum()
+                columns[f"{kind}_along_m"][k] = metres[follows].sum()
+                columns[f"{kind}_short"][k] = (np.bincount(piece, weights=metres)[np.unique(piece)] < SHORT_M).sum()
+    return columns
 
 
-def _inner_lines(models: Sequence[RoofModel]) -> FloatArray:
-    """Steps and common walls of the models of a block as straight lines between junctions, (n, 2, 2)."""
+def _inner_lines(models: Sequence[RoofModel]) -> tuple[FloatArray, FloatArray]:
+    """The common walls of the models of a block, and walls and steps together, as straight lines, (n, 2, 2) each."""
     segments = roof_segments(models, range(len(models)))
     vertices, ends = welded(segments.ends[:, :, :2].reshape(-1, 2))
     pieces, source = split(vertices, ends.reshape(-1, 2))
@@ -172,8 +176,14 @@ def _inner_lines(models: Sequence[RoofModel]) -> FloatArray:
         apart: FloatArray = most - least
         return apart
 
-    inner = (spread(segments.owner[source].astype(np.float64)) > 0.0) | (spread(height) > STEP_M)
-    chains = shapely.get_parts(shapely.line_merge(shapely.multilinestrings(vertices[unique[inner]])))
+    wall = spread(segments.owner[source].astype(np.float64)) > 0.0
+    step = spread(height) > STEP_M
+    return _straight_lines(vertices[unique[wall]]), _straight_lines(vertices[unique[wall | step]])
+
+
+def _straight_lines(stretches: FloatArray) -> FloatArray:
+    """Stretches (e, 2, 2) joined where two meet, and made straight: lines between corners and junctions, (n, 2, 2)."""
+    chains = shapely.get_parts(shapely.line_merge(shapely.multilinestrings(stretches)))
     corners, chain = shapely.get_coordinates(shapely.simplify(chains, STRAIGHT_M), return_index=True)
     follows = chain[1:] == chain[:-1]
     return np.stack([corners[:-1][follows], corners[1:][follows]], axis=1)
@@ -272,17 +282,15 @@ def _f1(sums: Sums) -> FloatArray:
 
 def measures(score: FormScore) -> list[Measure]:
     """The figures; models, drawn outlines and blocks are resampled."""
-    figures = [*_regular("", score.found)]
-    inner = {name: column[score.inner["length_m"] > 0.0] for name, column in score.inner.items()}
-    metres = inner["length_m"].sum()
-    figures += measured_all(
-        inner,
-        MODELS_ALONE,
-        [
-            ("form.inner_short_edges", _per_100m, metres),
-            ("form.inner_two_directions", share("along_m", "length_m"), metres),
-        ],
-    )
+    figures = _regular("", score.found)
+    inner = {name: column[score.inner["inner_length_m"] > 0.0] for name, column in score.inner.items()}
+    for kind in _KINDS:
+        length, metres = f"{kind}_length_m", inner[f"{kind}_length_m"].sum()
+        statistics = (
+            (f"form.{kind}_short_edges", _per_100m(f"{kind}_short", length), metres),
+            (f"form.{kind}_two_directions", share(f"{kind}_along_m", length), metres),
+        )
+        figures += measured_all(inner, MODELS_ALONE, statistics)
     if not score.drawn:
         return figures
     figures += _regular("drawn_", score.drawn)
@@ -294,12 +302,12 @@ def measures(score: FormScore) -> list[Measure]:
     for tolerance in TOLERANCES_M:
         at = tolerance_name(tolerance)
         corners = {"right": blocks[f"right_{at}"], "found": blocks["found"], "drawn": blocks["drawn"]}
-        statistics = (
+        shares = (
             (f"form.corner_precision_{at}", share("right", "found"), found),
             (f"form.corner_recall_{at}", share("right", "drawn"), drawn),
             (f"form.corner_f1_{at}", Share(figure=_f1, denominator="drawn"), found + drawn),
         )
-        figures += measured_all(corners, MODELS_ALONE, statistics)
+        figures += measured_all(corners, MODELS_ALONE, shares)
     n = blocks["away"].sum()
     figures += measured_all(
         blocks,
@@ -313,8 +321,10 @@ def measures(score: FormScore) -> list[Measure]:
     return figures
 
 
-def _per_100m(sums: Sums) -> FloatArray:
-    return 100.0 * ratio("short", "length_m")(sums)
+def _per_100m(short: str, length_m: str) -> Statistic:
+    """Short pieces per 100 m."""
+    per_metre = ratio(short, length_m)
+    return lambda sums: 100.0 * per_metre(sums)
 
 
 def _regular(which: str, columns: Mapping[str, FloatArray]) -> list[Measure]:
@@ -326,7 +336,7 @@ def _regular(which: str, columns: Mapping[str, FloatArray]) -> list[Measure]:
             (f"form.{which}two_directions", share("along_m", "length_m"), n["length_m"]),
             (f"form.{which}right_corners", share("right", "corners"), n["corners"]),
             (f"form.{which}acute_outlines", share("acute", "outlines"), n["outlines"]),
-            (f"form.{which}short_edges", _per_100m, n["length_m"]),
+            (f"form.{which}short_edges", _per_100m("short", "length_m"), n["length_m"]),
             (f"form.{which}triangles", total("triangles"), n["outlines"]),
             (f"form.{which}corners", ratio("corners", "outlines"), n["outlines"]),
         ],
@@ -340,9 +350,14 @@ _BLOCKS = (
     "of it, with an IoU >= 0.5"
 )
 _SIDES = (("", "", ""), ("drawn_", ", drawn", "of the drawn outlines: "))
+_WALLS = "edges in plan that two models of a block share"
 _INNER = (
-    "edges in plan that two models of a block share, or two faces of one model whose heights differ by more than "
-    f"{STEP_M:g} m in the middle of the edge"
+    ("wall", "common walls", _WALLS),
+    (
+        "inner",
+        "steps and common walls",
+        f"{_WALLS}, or two faces of one model whose heights differ by more than {STEP_M:g} m in the middle of the edge",
+    ),
 )
 
 
@@ -381,21 +396,25 @@ def _definitions_at(tolerance_m: float) -> tuple[Definition, ...]:
     )
 
 
+def _definitions_inside(kind: str, label: str, edges: str) -> tuple[Definition, ...]:
+    """The measures of edges inside blocks."""
+    short = f"pieces under {SHORT_M:g} m / length, times 100 m; {edges}; merged where collinear within "
+    along = f"share of their length within {ALONG_DEG:g} deg of the two directions of their block; {edges}; n in metres"
+    return (
+        defined(
+            f"form.{kind}_short_edges",
+            f"short pieces of {label} per 100 m",
+            f"{short}{100 * STRAIGHT_M:g} cm",
+            Better.LOWER,
+            "",
+        ),
+        defined(f"form.{kind}_two_directions", f"{label} along two directions", along),
+    )
+
+
 DEFINITIONS = (
     *_definitions_of(*_SIDES[0]),
-    defined(
-        "form.inner_short_edges",
-        "short steps and common walls per 100 m",
-        f"pieces under {SHORT_M:g} m / length, times 100 m; {_INNER}; merged where collinear within "
-        f"{100 * STRAIGHT_M:g} cm",
-        Better.LOWER,
-        "",
-    ),
-    defined(
-        "form.inner_two_directions",
-        "steps and common walls along two directions",
-        f"share of their length within {ALONG_DEG:g} deg of the two directions of their block; {_INNER}; n in metres",
-    ),
+    *(one for kind in _INNER for one in _definitions_inside(*kind)),
     *_definitions_of(*_SIDES[1]),
     defined(
         "form.blocks",

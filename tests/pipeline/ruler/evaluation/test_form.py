@@ -50,7 +50,7 @@ L_SHAPE = [(0, 0), (14, 0), (14, 6), (6, 6), (6, 12), (0, 12)]
 @pytest.mark.parametrize("turn_deg", [0.0, 27.0, 88.0])
 def test_right_angles_are_regular_in_every_direction(ring: Ring, turn_deg: float) -> None:
     found = form([moved(shed("a", ring), 0.0, 0.0, 0.0, turn_deg)])
-    assert {name: value for name, value in found.items() if not name.startswith("inner_")} == pytest.approx(
+    assert {name: value for name, value in found.items() if not name.startswith(("inner_", "wall_"))} == pytest.approx(
         {
             "two_directions": 1.0,
             "right_corners": 1.0,
@@ -98,7 +98,7 @@ def test_a_common_wall_of_two_houses() -> None:
     pair = [shed("a", rectangle(0, 0, 10, 8)), shed("b", rectangle(10, 0, 20, 8))]
     found = form(pair)
     assert (found["inner_short_edges"], found["inner_two_directions"]) == (0.0, 1.0)
-    assert denominators(pair)["inner_two_directions"] == 8
+    assert denominators(pair)["inner_two_directions"] == denominators(pair)["wall_two_directions"] == 8
     assert denominators([pair[0], shed("b", rectangle(12, 0, 20, 8))])["inner_two_directions"] == 0
 
 
@@ -130,6 +130,7 @@ def test_steps_are_inner_edges_and_ridges_are_not() -> None:
         return [model("a", RoofType.FLAT, [left, right])]
 
     assert denominators(halves(2.0))["inner_two_directions"] == 8
+    assert denominators(halves(2.0))["wall_two_directions"] == 0
     assert denominators(halves(0.1))["inner_two_directions"] == 0
     assert denominators([gable("a")])["inner_two_directions"] == 0
 
