@@ -282,7 +282,8 @@ def _f1(sums: Sums) -> FloatArray:
 
 def measures(score: FormScore) -> list[Measure]:
     """The figures; models, drawn outlines and blocks are resampled."""
-    figures = _regular("", score.found)
+    sides = [_regular(which, columns) for which, columns in (("", score.found), ("drawn_", score.drawn)) if columns]
+    figures = [one for beside in zip(*sides, strict=True) for one in beside]
     inner = {name: column[score.inner["inner_length_m"] > 0.0] for name, column in score.inner.items()}
     for kind in _KINDS:
         length, metres = f"{kind}_length_m", inner[f"{kind}_length_m"].sum()
@@ -293,7 +294,6 @@ def measures(score: FormScore) -> list[Measure]:
         figures += measured_all(inner, MODELS_ALONE, statistics)
     if not score.drawn:
         return figures
-    figures += _regular("drawn_", score.drawn)
     blocks, all_blocks = score.blocks, len(score.blocks["iou"])
     figures.append(measured("form.blocks", blocks, total("compared"), n=all_blocks, subset=MODELS_ALONE))
     blocks = {name: column[blocks["compared"] > 0.0] for name, column in blocks.items()}
@@ -413,9 +413,8 @@ def _definitions_inside(kind: str, label: str, edges: str) -> tuple[Definition, 
 
 
 DEFINITIONS = (
-    *_definitions_of(*_SIDES[0]),
+    *(one for beside in zip(*(_definitions_of(*side) for side in _SIDES), strict=True) for one in beside),
     *(one for kind in _INNER for one in _definitions_inside(*kind)),
-    *_definitions_of(*_SIDES[1]),
     defined(
         "form.blocks",
         "blocks compared",
