@@ -14,7 +14,7 @@ import shapely
 from scipy.spatial import KDTree
 
 from pipeline.kernels.union_find import united
-from pipeline.model import FloatArray, IntArray
+from pipeline.model import BoolArray, FloatArray, IntArray
 from pipeline.ruler.evaluation.bootstrap import Share, Statistic, Sums, quantile, ratio, share
 from pipeline.ruler.evaluation.building_matching import (
     MIN_IOU,
@@ -137,24 +137,26 @@ _KINDS = ("wall", "inner")
 def _inner_edges(models: Sequence[RoofModel], blocks: Geometries, block: IntArray) -> Columns:
     """The columns of `FormScore.inner`, (b,)."""
     columns = {f"{kind}_{name}": np.zeros(len(blocks)) for kind in _KINDS for name in ("length_m", "along_m", "short")}
-    order = np.argsort(block, kind="stable")
-    ends = np.searchsorted(block[order], np.arange(len(blocks) + 1))
-    for k, (first, last) in enumerate(zip(ends[:-1].tolist(), ends[1:].tolist(), strict=True)):
-        for kind, lines in zip(_KINDS, _inner_lines([models[m] for m in order[first:last].tolist()]), strict=True):
-            if len(lines):
-                _, length_m, direction = edges_of(ring_of(blocks[k]))
-                along = lines[:, 1] - lines[:, 0]
-                metres = np.hypot(along[:, 0], along[:, 1])
-                follows = off(directions(along), main_direction(direction, length_m)) <= ALONG_DEG
-                piece = _straight_pieces(lines)
-                columns[f"{kind}_length_m"][k] = metres.sum()
-                columns[f"{kind}_along_m"][k] = metres[follows].sum()
-                columns[f"{kind}_short"][k] = (np.bincount(piece, weights=metres)[np.unique(piece)] < SHORT_M).sum()
+    stretches, owner, is_wall = _inner_stretches(models)
+    of = block[owner]
+    order = np.argsort(of, kind="stable")
+    for here in np.split(order, np.flatnonzero(np.diff(of[order])) + 1) if len(of) else ():
+        k = int(of[here[0]])
+        _, length_m, direction = edges_of(ring_of(blocks[k]))
+        main = main_direction(direction, length_m)
+        for kind, chosen in zip(_KINDS, (here[is_wall[here]], here), strict=True):
+            lines = _straight_lines(stretches[chosen])
+            along = lines[:, 1] - lines[:, 0]
+            metres = np.hypot(along[:, 0], along[:, 1])
+            piece = _straight_pieces(lines)
+            columns[f"{kind}_length_m"][k] = metres.sum()
+            columns[f"{kind}_along_m"][k] = metres[off(directions(along), main) <= ALONG_DEG].sum()
+            columns[f"{kind}_short"][k] = (np.bincount(piece, weights=metres)[np.unique(piece)] < SHORT_M).sum()
     return columns
 
 
-def _inner_lines(models: Sequence[RoofModel]) -> tuple[FloatArray, FloatArray]:
-    """The common walls of the models of a block, and walls and steps together, as straight lines, (n, 2, 2) each."""
+def _inner_stretches(models: Sequence[RoofModel]) -> tuple[FloatArray, IntArray, BoolArray]:
+    """Stretches of common walls and steps in plan, (e, 2, 2), a model of each, (e,), and whether it is a wall, (e,)."""
     segments = roof_segments(models, range(len(models)))
     vertices, ends = welded(segments.ends[:, :, :2].reshape(-1, 2))
     pieces, source = split(vertices, ends.reshape(-1, 2))
@@ -166,19 +168,17 @@ def _inner_lines(models: Sequence[RoofModel]) -> tuple[FloatArray, FloatArray]:
     share_of = (middle * along).sum(axis=1) / np.maximum((along**2).sum(axis=1), 1e-12)
     height = low[:, 2] + share_of * (high - low)[:, 2]
     unique, stretch = np.unique(np.sort(pieces, axis=1), axis=0, return_inverse=True)
-    stretch, count = stretch.ravel(), len(unique)
-
-    def spread(values: FloatArray) -> FloatArray:
-        """Largest less smallest value of each stretch."""
-        most, least = np.full(count, -np.inf), np.full(count, np.inf)
-        np.maximum.at(most, stretch, values)
-        np.minimum.at(least, stretch, values)
-        apart: FloatArray = most - least
-        return apart
-
-    wall = spread(segments.owner[source].astype(np.float64)) > 0.0
-    step = spread(height) > STEP_M
-    return _straight_lines(vertices[unique[wall]]), _straight_lines(vertices[unique[wall | step]])
+    last, lowest, highest = np.full(len(unique), -1), np.full(len(unique), np.inf), np.full(len(unique), -np.inf)
+    first, owner = np.full(len(unique), len(models)), segments.owner[source]
+    for extreme, ufunc, values in (
+        (first, np.minimum, owner),
+        (last, np.maximum, owner),
+        (lowest, np.minimum, height),
+        (highest, np.maximum, height),
+    ):
+        ufunc.at(extreme, stretch.ravel(), values)
+    inner = (last > first) | (highest - lowest > STEP_M)
+    return vertices[unique[inner]], first[inner], (last > first)[inner]
 
 
 def _straight_lines(stretches: FloatArray) -> FloatArray:
@@ -193,9 +193,11 @@ def _straight_pieces(lines: FloatArray) -> IntArray:
     """The piece of each line, (n,): at a junction the two lines that go straight on, within `STRAIGHT_M`, are one."""
     vertices, ends = welded(lines.reshape(-1, 2))
     pairs = []
-    for junction in range(len(vertices)):
-        at = np.flatnonzero(ends == junction)
-        towards = vertices[ends[at ^ 1]] - vertices[junction]
+    order = np.argsort(ends, kind="stable")
+    for at in np.split(order, np.cumsum(np.bincount(ends, minlength=len(vertices)))[:-1]) if len(lines) else ():
+        if len(at) < 2:
+            continue
+        towards = vertices[ends[at ^ 1]] - vertices[ends[at]]
         a, b = np.triu_indices(len(at), 1)
         chord = towards[b] - towards[a]
         away = np.abs(towards[a][:, 0] * towards[b][:, 1] - towards[a][:, 1] * towards[b][:, 0])
