@@ -256,8 +256,8 @@ def _block_corners(block: shapely.Geometry) -> FloatArray:
 
 
 def _places_along(block: shapely.Geometry) -> FloatArray:
-    """Places on the exterior of a block, (s, 2)."""
-    ring = shapely.get_exterior_ring(block)
+    """Places on the exterior of a block, (s, 2), from its most western corner on, however its ring is written."""
+    ring = shapely.get_exterior_ring(shapely.normalize(block))
     places = shapely.line_interpolate_point(ring, np.arange(0.0, ring.length, _SPACING_M))
     xy: FloatArray = shapely.get_coordinates(places)
     return xy

@@ -155,6 +155,11 @@ def test_an_outline_that_is_0_7_m_off_has_its_corners_at_a_metre_only() -> None:
     assert found["outline_distance_p90"] == pytest.approx(0.7, abs=0.01)
 
 
+def test_it_does_not_matter_at_which_corner_a_ring_begins() -> None:
+    again = [*L_SHAPE[3:], *L_SHAPE[:3]]
+    assert form([shed("a", again)], [drawn(L_SHAPE)])["outline_distance_p90"] == pytest.approx(0.0, abs=1e-5)
+
+
 def test_extra_corners_cost_precision_and_missing_ones_recall() -> None:
     found = form(
         [shed("a", rectangle(0, 0, 14, 12))], [drawn([(0, 0), (14, 0), (14, 10), (12, 10), (12, 12), (0, 12)])]
