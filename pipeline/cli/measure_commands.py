@@ -123,7 +123,9 @@ def evaluate(
     ],
     truth: Truth = None,
     points: Points = None,
-    footprints: Annotated[str | None, typer.Option(metavar="FILE", help="Building outlines for the points.")] = None,
+    footprints: Annotated[
+        str | None, typer.Option(metavar="FILE", help="Drawn outlines: of the points, and for the form of outlines.")
+    ] = None,
     ground: Annotated[
         list[str] | None,
         typer.Option(metavar="FILE", help="The same points, classified by another program: judge its ground."),
@@ -149,7 +151,7 @@ def evaluate(
     quiet: Quiet = False,
     **given: Any,
 ) -> None:
-    """Measure models: against simulated truth, classified points, true roof edges, or alone."""
+    """Measure models: against simulated truth, classified points, drawn outlines, true roof edges, or alone."""
     with Console(as_json=as_json, quiet=quiet) as console:
         from pipeline.ruler.evaluation.evaluate_files import EvaluationRequest, evaluate_files
         from pipeline.runtime.monitoring.progress import Event

@@ -8,6 +8,7 @@ from typing import Any
 from pipeline.errors import CrsError
 from pipeline.io.crs import horizontal_part, vertical_part
 from pipeline.io.crs_units import states_unit_alone
+from pipeline.ruler.epochs.change_records import Doubt
 from pipeline.ruler.epochs.epoch import Epoch
 
 
@@ -20,15 +21,15 @@ def check_agreement(old: Epoch, new: Epoch) -> tuple[str, ...]:
             count = len(manifest.failed_tiles)
             warnings.append(f"{count} {'tile' if count == 1 else 'tiles'} of {epoch.name} failed")
         warnings += [f"{epoch.name}: {note}" for note in epoch.coverage.notes]
-    before, after = old.manifest, new.manifest
-    if before.method != after.method:
-        warnings.append(f"the methods differ: OLD is of {before.method}, NEW of {after.method}")
-    elif before.settings_hash != after.settings_hash:
-        differing = _differing(before.settings, after.settings)
-        warnings.append(f"the settings differ: {differing or 'see run.json of both'}")
-    if before.engine_version != after.engine_version:
-        warnings.append(f"the versions differ: OLD is of {before.engine_version}, NEW of {after.engine_version}")
-    given = [manifest.request.get("footprints") is not None for manifest in (before, after)]
+    differing = differing_makers(old, new)
+    warnings += [f"the {what} differ: {how}" for what, how in differing.items()]
+    if differing:
+        warnings.append(
+            f"other {' and '.join(differing)} may draw outlines and roofs anew where nothing was built: areas, volumes "
+            f"and iou show that, too, and reshaped rows have the doubt {Doubt.OTHER_VERSION.value}. For changes of the "
+            "place alone run the points of OLD again as NEW was run"
+        )
+    given = [epoch.manifest.request.get("footprints") is not None for epoch in (old, new)]
     if given[0] != given[1]:
         which, other = ("OLD", "NEW") if given[0] else ("NEW", "OLD")
         warnings.append(
@@ -36,6 +37,19 @@ def check_agreement(old: Epoch, new: Epoch) -> tuple[str, ...]:
             "has no building without a footprint"
         )
     return tuple(warnings)
+
+
+def differing_makers(old: Epoch, new: Epoch) -> dict[str, str]:
+    """How versions, methods or settings of two runs differ, in words by what differs; empty if none do."""
+    before, after = old.manifest, new.manifest
+    found = {}
+    if before.engine_version != after.engine_version:
+        found["versions"] = f"OLD is of {before.engine_version}, NEW of {after.engine_version}"
+    if before.method != after.method:
+        found["methods"] = f"OLD is of {before.method}, NEW of {after.method}"
+    elif before.settings_hash != after.settings_hash:
+        found["settings"] = _differing(before.settings, after.settings) or "see run.json of both"
+    return found
 
 
 def _check_reference(old: Epoch, new: Epoch) -> list[str]:

@@ -96,6 +96,7 @@ class Doubt(StrEnum):
     NEAR_LIMIT = "near_limit"
     OVERLAPS_ANOTHER = "overlaps_another"
     OTHER_UNITS = "other_units"
+    OTHER_VERSION = "other_version"
 
 
 DOUBTS: Mapping[Doubt, str] = {
@@ -108,6 +109,7 @@ DOUBTS: Mapping[Doubt, str] = {
     Doubt.NEAR_LIMIT: "`change_ratio` is between 2/3 and 3/2: a small difference would change the verdict",
     Doubt.OVERLAPS_ANOTHER: "new or gone, and more than a tenth of it overlaps a building of the other epoch",
     Doubt.OTHER_UNITS: "the epochs divide the same place into different numbers of buildings",
+    Doubt.OTHER_VERSION: "reshaped, and the runs differ in version, method or settings: its outline may be drawn anew",
 }
 """Meanings of the doubts."""
 

@@ -13,6 +13,7 @@ import shapely
 
 from pipeline.export.stored_coordinates import decimals
 from pipeline.model import BoolArray, FloatArray, IntArray
+from pipeline.ruler.epochs.agreement import differing_makers
 from pipeline.ruler.epochs.change_records import SCHEMA, Change
 from pipeline.ruler.epochs.epoch import Buildings, Epoch
 from pipeline.ruler.epochs.epoch_matching import Groups, all_pairs, around, grouped, meeting, middles, parts_of
@@ -233,7 +234,7 @@ def _circumstances(
         overlap += np.bincount(place[kept], weights=pairs.common_m2[kept], minlength=count)
     area_m2 = np.nan_to_num(before["area_m2"]) + np.nan_to_num(after["area_m2"])
     overlapped = np.divide(overlap, area_m2, out=np.zeros(count), where=area_m2 > 0.0)
-    return known | {"overlapped": overlapped}
+    return known | {"overlapped": overlapped, "made_otherwise": bool(differing_makers(old, new))}
 
 
 def _rejected_alike(epoch: Epoch, footprints: Any, area_m2: FloatArray, height_m: FloatArray) -> BoolArray:

@@ -52,8 +52,9 @@ def judge(
     """Judge every group by its figures (g, 16) from `compare_roofs`: the columns of the table on the verdict.
 
     `seen` is what `comparing` knows of the place of each group: `covered_old`, the share of the footprint where the
-    earlier epoch has data, `tile_failed_old`, `rejected_old`, the same of the later one, and `overlapped`, the share
-    that overlaps buildings of the other epoch outside of the group.
+    earlier epoch has data, `tile_failed_old`, `rejected_old`, the same of the later one, `overlapped`, the share that
+    overlaps buildings of the other epoch outside of the group, and `made_otherwise`, whether the runs differ in more
+    than their points.
     """
     only_old, only_new = new["count"] == 0, old["count"] == 0
     both = ~only_old & ~only_new
@@ -90,6 +91,7 @@ def judge(
         (Doubt.NEAR_LIMIT, near & ~hidden),
         (Doubt.OVERLAPS_ANOTHER, overlapping & ~hidden),
         (Doubt.OTHER_UNITS, both & (old["count"] != new["count"])),
+        (Doubt.OTHER_VERSION, reshaped & ~hidden & seen["made_otherwise"]),
     )
     return {
         "change": change,

@@ -22,6 +22,7 @@ TITLES = {
     Group.WIREFRAMES: "Roof edges and corners",
     Group.ROOF_TYPES: "Roof types",
     Group.FOOTPRINTS: "Footprints",
+    Group.FORM: "Form of outlines",
     Group.DETECTION: "Detection of buildings",
     Group.GROUND: "Ground filter",
     Group.VALIDITY: "Validity of the solids",

@@ -6,10 +6,12 @@ from collections.abc import Mapping
 from types import MappingProxyType
 
 from pipeline.ruler.evaluation import (
+    board_scores,
     delivery,
     detection_scores,
     face_scores,
     footprints,
+    form_scores,
     ground_scores,
     residual_scores,
     roof_types,
@@ -25,8 +27,10 @@ _MODULES = (
     surface,
     face_scores,
     wireframe_scores,
+    board_scores,
     roof_types,
     footprints,
+    form_scores,
     detection_scores,
     ground_scores,
     validity_scores,

@@ -10,22 +10,29 @@ import pyarrow as pa
 import shapely
 
 from pipeline.model import RoofType
-from pipeline.ruler.evaluation import delivery, footprints, roof_types, surface
+from pipeline.ruler.evaluation import delivery, footprints, form_scores, roof_types, surface
 from pipeline.ruler.evaluation import face_scores as faces
 from pipeline.ruler.evaluation import score_tables as tables
 from pipeline.ruler.evaluation import validity_scores as validity
 from pipeline.ruler.evaluation.block_scores import joined_reference
+from pipeline.ruler.evaluation.board_scores import board_measures, score_board
 from pipeline.ruler.evaluation.building_matching import match_footprints
 from pipeline.ruler.evaluation.detection_scores import detect, detection_measures
 from pipeline.ruler.evaluation.divisions import WholeModels, undivided, whole_models
 from pipeline.ruler.evaluation.ground_scores import FoundGround, ground_blocks, ground_measures
 from pipeline.ruler.evaluation.measure import Measure
 from pipeline.ruler.evaluation.models import ModelSet
+from pipeline.ruler.evaluation.reading.drawn_outlines import OutlineSet
 from pipeline.ruler.evaluation.reading.wireframe_files import WireframeSet
 from pipeline.ruler.evaluation.reference import Reference
 from pipeline.ruler.evaluation.residual_scores import building_residuals, residual_measures
 from pipeline.ruler.evaluation.subsets import subsets
 from pipeline.ruler.evaluation.wireframe_scores import WireframeScore, score_wireframes, wireframe_measures
+
+_SAME_OUTLINES = (
+    "The models follow given footprints, and so does the reference: where these are the same, outlines and detection "
+    "agree by themselves and say nothing about the method."
+)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -43,6 +50,8 @@ class Evaluation:
     """Assumptions and omissions of the measures."""
     wireframes: WireframeSet | None = None
     """The true wireframes; None without any."""
+    outlines: OutlineSet | None = None
+    """The drawn outlines; None without any."""
     statistics: Mapping[str, Any] | None = None
     """The figures of the run's records, from `run_statistics`; None for models of other programs."""
 
@@ -72,14 +81,16 @@ def evaluate(
     blocks: bool | None = None,
     ground: FoundGround | None = None,
     wireframes: WireframeSet | None = None,
+    outlines: OutlineSet | None = None,
     on_step: Callable[[str], None] = lambda _: None,
 ) -> Evaluation:
-    """Measure models; without a reference only delivery and validity.
+    """Measure models; without a reference only delivery, the form of outlines and validity.
 
     `blocks` joins true buildings that touch; by default as in `needs_blocks`. Without the found ground its measures
-    are left out. Roof edges and corners are measured against the wireframes, with or without a reference. `on_step` is
-    called with the name of each step as it begins. The points of the reference are read once for the residuals, and
-    once each for detection against points and for the ground.
+    are left out. Roof edges and corners are measured against the wireframes, and outlines beside the drawn ones, else
+    beside those of simulated truth, with or without a reference. `on_step` is called with the name of each step as it
+    begins. The points of the reference are read once for the residuals, and once each for detection against points and
+    for the ground.
     """
     on_step("solids")
     solids = validity.validity(models)
@@ -88,6 +99,10 @@ def evaluate(
     measures: list[Measure] = []
     notes: list[str] = []
     wholes = undivided(models.models)
+    if outlines is not None:
+        notes += [*outlines.notes, *([_SAME_OUTLINES] if models.has_footprints else [])]
+    elif reference is not None and reference.outlines == "truth":
+        outlines = OutlineSet(name=reference.name, outlines=tuple(one.footprint for one in reference.buildings))
     if reference is not None:
         if needs_blocks(models, reference) if blocks is None else blocks:
             wholes = whole_models(models.models, reference)
@@ -98,6 +113,10 @@ def evaluate(
     else:
         measures += delivery.record_measures(models)
         found["models"] = tables.model_table(models, solids, None)
+    on_step("form")
+    form = form_scores.score_form(models.models, () if outlines is None else outlines.outlines)
+    measures += form_scores.measures(form)
+    found |= tables.form_tables(form, models.models)
     if reference is not None and ground is not None and reference.has_ground:
         on_step("ground")
         judged = ground_blocks(reference, ground)
@@ -106,8 +125,10 @@ def evaluate(
     if wireframes is not None:
         on_step("wireframes")
         score = score_wireframes(models.models, wireframes.wireframes)
-        measures += wireframe_measures(score)
-        found["wireframes"] = tables.wireframe_table(score)
+        of = {model.building_id: model for model in models.models}
+        board = score_board(wireframes.wireframes, [[of[name] for name in names] for names in score.model_ids])
+        measures += wireframe_measures(score) + board_measures(board)
+        found["wireframes"] = tables.wireframe_table(score, board)
         notes += [*wireframes.notes, *_wireframe_notes(models, score)]
     return Evaluation(
         models=models,
@@ -116,6 +137,7 @@ def evaluate(
         tables=found,
         notes=tuple(notes),
         wireframes=wireframes,
+        outlines=outlines,
     )
 
 
@@ -179,10 +201,7 @@ def _notes(models: ModelSet, reference: Reference) -> tuple[str, ...]:
     if reference.has_faces and not has_roof_types(models):
         found.append("No model has a roof type: types, and the outcomes that need them, are not judged.")
     if models.has_footprints and reference.outlines == "given":
-        found.append(
-            "The models follow given footprints, and so does the reference: where these are the same, outlines and "
-            "detection agree by themselves and say nothing about the method."
-        )
+        found.append(_SAME_OUTLINES)
     known = [building.footprint for building in reference.buildings]
     if reference.extent is not None:
         known.append(reference.extent)

@@ -13,6 +13,7 @@ from pipeline.ruler.evaluation.evaluate import Evaluation, evaluate
 from pipeline.ruler.evaluation.ground_scores import FoundGround, GroundOfFiles, GroundOfRun
 from pipeline.ruler.evaluation.models import ModelSet
 from pipeline.ruler.evaluation.reading import read_models
+from pipeline.ruler.evaluation.reading.drawn_outlines import read_outlines
 from pipeline.ruler.evaluation.reading.wireframe_files import read_wireframes
 from pipeline.ruler.evaluation.reference import Reference
 from pipeline.ruler.evaluation.reference_points import read_points_reference
@@ -32,7 +33,7 @@ class EvaluationRequest:
     """The folder of simulated truth."""
     points: tuple[str, ...] = ()
     footprints: str | None = None
-    """Outlines of buildings, with points."""
+    """Outlines of buildings as people drew them: of the points, if there are any, and for the form of outlines."""
     footprints_layer: str | None = None
     """Their layer, where the file has several."""
     ground: tuple[str, ...] = ()
@@ -53,8 +54,6 @@ class EvaluationRequest:
         faults = []
         if self.truth is not None and self.points:
             faults.append("both a truth and points are given as the reference: use one of --truth and --points")
-        if self.footprints is not None and not self.points:
-            faults.append(f"footprints are {self.footprints} without points: give the classified tile by --points")
         if self.footprints_layer is not None and self.footprints is None:
             faults.append(f"the layer {self.footprints_layer} is given without footprints: give --footprints")
         if self.as_surveyed and self.truth is None:
@@ -84,7 +83,8 @@ def evaluate_files(
 ) -> Evaluation:
     """Read and measure; `reference` is that of the same request, if it serves several models.
 
-    Raises InputError if models, reference or wireframes cannot be read, and RunError if a run directory is damaged.
+    Raises InputError if models, reference, wireframes or outlines cannot be read, and RunError if a run directory is
+    damaged.
     """
     drawn = None if request.wireframes is None else read_wireframes(request.wireframes)
     on_step("models")
@@ -94,7 +94,18 @@ def evaluate_files(
         reference = read_reference(request)
     options = ReadOptions(crs=request.crs, vertical_unit=request.vertical_unit)
     ground = None if reference is None else _ground(request.ground, models, reference, options)
-    found = evaluate(models, reference, blocks=request.blocks, ground=ground, wireframes=drawn, on_step=on_step)
+    outlines = None
+    if request.footprints is not None:
+        outlines = read_outlines(request.footprints, request.footprints_layer, models)
+    found = evaluate(
+        models,
+        reference,
+        blocks=request.blocks,
+        ground=ground,
+        wireframes=drawn,
+        outlines=outlines,
+        on_step=on_step,
+    )
     return dataclasses.replace(found, statistics=run_statistics(models.path)) if models.kind == "run" else found
 
 

@@ -112,9 +112,12 @@ def subject_sentences(evaluation: Evaluation) -> tuple[str, str]:
     measured = f"{models.name}: {_counted(len(models.models), 'model')} ({kinds[models.kind]})"
     if models.failed:
         measured += f", {_counted(len(models.failed), 'record')} without a model"
-    edges = "" if evaluation.wireframes is None else _drawn(evaluation.wireframes)
+    drawn = [] if evaluation.wireframes is None else [_drawn(evaluation.wireframes)]
+    outlines = evaluation.outlines
+    if outlines is not None and (reference is None or reference.outlines != "truth"):
+        drawn.append(f"{outlines.name}: {_counted(len(outlines.outlines), 'drawn outline')}")
     if reference is None:
-        return f"{measured}.", f"{edges}." if edges else "Nothing: the models alone."
+        return f"{measured}.", f"{'; '.join(drawn)}." if drawn else "Nothing: the models alone."
     against = f"{reference.name}: {_counted(len(reference.buildings), 'building')}"
     if reference.has_faces:
         against += " with true roof faces"
@@ -123,8 +126,7 @@ def subject_sentences(evaluation: Evaluation) -> tuple[str, str]:
         against += f" ({origins.get(reference.outlines, reference.outlines)})"
     points = len(reference.tiles)
     against += f", points of {_counted(points, 'tile')}" if points else ", no points"
-    against += f"; {edges}" if edges else ""
-    return f"{measured}.", f"{against}."
+    return f"{measured}.", f"{'; '.join([against, *drawn])}."
 
 
 def _drawn(wireframes: WireframeSet) -> str:

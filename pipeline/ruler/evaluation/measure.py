@@ -25,6 +25,7 @@ class Group(StrEnum):
     WIREFRAMES = "wireframes"
     ROOF_TYPES = "roof_types"
     FOOTPRINTS = "footprints"
+    FORM = "form"
     DETECTION = "detection"
     GROUND = "ground"
     VALIDITY = "validity"

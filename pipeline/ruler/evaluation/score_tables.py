@@ -13,6 +13,7 @@ from pipeline.model import IntArray
 from pipeline.ruler.evaluation.delivery import Delivery, Stands
 from pipeline.ruler.evaluation.divisions import WholeModels
 from pipeline.ruler.evaluation.face_scores import FaceScore, FaceVerdict
+from pipeline.ruler.evaluation.form_scores import FormScore
 from pipeline.ruler.evaluation.ground_scores import tile_figures
 from pipeline.ruler.evaluation.models import ModelSet, RoofModel
 from pipeline.ruler.evaluation.reference import Reference
@@ -199,7 +200,7 @@ def ground_table(blocks: Columns) -> pa.Table:
     return _table({name: figures[name] for name in ("tile", "type_1", "type_2", "total", "kappa", "ground", "object")})
 
 
-def wireframe_table(score: WireframeScore) -> pa.Table:
+def wireframe_table(score: WireframeScore, board: Columns) -> pa.Table:
     """One row per true wireframe."""
     columns: dict[str, Any] = {
         "building_id": list(score.building_ids),
@@ -218,4 +219,14 @@ def wireframe_table(score: WireframeScore) -> pa.Table:
                 for name, statistic in STATISTICS.items():
                     figure = statistic(score.columns(kind, k))
                     columns[f"{kind}_{name}_{tolerance_name(tolerance)}"] = figure
+    columns |= {f"board_{name}": board[name].astype(np.int64) for name in ("right_corners", "right_edges")}
     return _table(columns)
+
+
+def form_tables(score: FormScore, models: Sequence[RoofModel]) -> Mapping[str, pa.Table]:
+    """One row per model: the form of its outlines; and one row per drawn block, if there are any."""
+    names = {"model_id": [model.building_id for model in models]}
+    found = {"outlines": _table(names | score.found)}
+    if score.blocks:
+        found["blocks"] = _table({name: column for name, column in score.blocks.items() if name != "away"})
+    return found

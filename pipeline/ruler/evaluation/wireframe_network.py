@@ -126,8 +126,8 @@ def _roof_faces(model: RoofModel) -> Iterator[list[FloatArray]]:
 def network(segments: Segments) -> Network:
     """Join segments to edges and corners."""
     count = len(segments.ends)
-    vertices, ends = _welded(segments.ends.reshape(-1, 3))
-    pieces, source = _split(vertices, ends.reshape(count, 2))
+    vertices, ends = welded(segments.ends.reshape(-1, 3))
+    pieces, source = split(vertices, ends.reshape(count, 2))
     real = pieces[:, 0] != pieces[:, 1]
     pieces, source = np.sort(pieces[real], axis=1), source[real]
     unique, stretch = np.unique(pieces, axis=0, return_inverse=True)
@@ -147,7 +147,7 @@ def network(segments: Segments) -> Network:
     )
 
 
-def _welded(xyz: FloatArray) -> tuple[FloatArray, IntArray]:
+def welded(xyz: FloatArray) -> tuple[FloatArray, IntArray]:
     """Vertices (v, 3), one for all within `WELD_M` of one another, and the vertex of each point (n,)."""
     pairs = KDTree(xyz).query_pairs(WELD_M, output_type="ndarray") if len(xyz) else np.zeros((0, 2), np.int64)
     graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(xyz), len(xyz)))
@@ -156,7 +156,7 @@ def _welded(xyz: FloatArray) -> tuple[FloatArray, IntArray]:
     return xyz[first], place.astype(np.int64)
 
 
-def _split(vertices: FloatArray, ends: IntArray) -> tuple[IntArray, IntArray]:
+def split(vertices: FloatArray, ends: IntArray) -> tuple[IntArray, IntArray]:
     """Edges (n, 2) cut at the vertices that lie on them: the pieces (p, 2), and the edge of each (p,)."""
     if not len(ends):
         return ends, np.zeros(0, np.int64)

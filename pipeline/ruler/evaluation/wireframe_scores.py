@@ -159,8 +159,8 @@ def _add(amounts: Mapping[str, FloatArray], true: Network, made: Network) -> Non
         count(name, one.corner_owner, np.ones(len(one.corners)), right)
 
 
-def sampled(edges: FloatArray) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Places on edges (e, 2, 3) in the middle of equal pieces: (s, 3), the metres of each (s,), and its edge (s,).
+def sampled(edges: FloatArray, spacing_m: float = SAMPLE_M) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Places on edges (e, 2, d) in the middle of equal pieces: (s, d), the metres of each (s,), and its edge (s,).
 
     Examples
     --------
@@ -169,7 +169,7 @@ def sampled(edges: FloatArray) -> tuple[FloatArray, FloatArray, IntArray]:
     """
     along = edges[:, 1] - edges[:, 0]
     length = np.linalg.norm(along, axis=1)
-    pieces = np.maximum(np.ceil(length / SAMPLE_M - _ROUNDING), 1).astype(np.int64)
+    pieces = np.maximum(np.ceil(length / spacing_m - _ROUNDING), 1).astype(np.int64)
     edge = np.repeat(np.arange(len(edges)), pieces)
     number = np.arange(len(edge)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
     share = (number + 0.5) / pieces[edge]

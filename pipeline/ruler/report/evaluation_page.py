@@ -39,6 +39,8 @@ HEADLINE = (
     ("delivery.records_doubtful",),
     ("delivery.records_fallback",),
     ("delivery.records_failed",),
+    ("form.corner_f1_0_5m",),
+    ("form.right_corners",),
 )
 """The main figures: the first measured one of each row, and the first eight of all rows."""
 HEADLINE_FIGURES = 8
@@ -57,7 +59,7 @@ def page(evaluation: Evaluation) -> str:
     found = chapters(evaluation)
     measured, against = subject_sentences(evaluation)
     name = evaluation.models.name
-    truth = evaluation.reference or evaluation.wireframes
+    truth = evaluation.reference or evaluation.wireframes or evaluation.outlines
     view = models_view(evaluation.models.models) if evaluation.reference is None else None
     return page_template("evaluation.html", "pipeline.ruler.report").render(
         title=name if truth is None else f"{name} against {truth.name}",

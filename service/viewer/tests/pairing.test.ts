@@ -1,6 +1,6 @@
 import { expect, test } from "vitest";
 import type { Listed } from "../src/models/batching";
-import { pairs, type Placed } from "../src/models/pairing";
+import { makersNote, pairs, type Placed } from "../src/models/pairing";
 
 type Plan = [number, number, number, number];
 
@@ -53,4 +53,13 @@ test("differences from their limits on are named with both values", () => {
 test("a failed building without a counterpart has nothing at its place", () => {
   expect(short(pairs([placed("a", null)], []))).toEqual(["gone a -"]);
   expect(short(pairs([], []))).toEqual([]);
+});
+
+test("another version or other settings are named with what they mean for shapes", () => {
+  const maker = { engine_version: "0.2.0", method: "arrangement", settings_hash: "ab" };
+  const meaning = "Outlines and roofs may be drawn anew where nothing was built.";
+  expect(makersNote(maker, maker)).toBeNull();
+  expect(makersNote(maker, { ...maker, engine_version: "0.3.0" })).toBe(`The versions differ: left is of 0.2.0, right of 0.3.0. ${meaning}`);
+  expect(makersNote(maker, { ...maker, settings_hash: "cd" })).toBe(`The settings differ. ${meaning}`);
+  expect(makersNote(maker, { ...maker, method: "kmeans", settings_hash: "cd" })).toBeNull();
 });

@@ -60,9 +60,10 @@ def test_the_class_of_the_points_can_be_the_reference(scene: ScenePaths) -> None
     assert not any(name.startswith(("faces.", "roof_types.")) for name in measured)
 
 
-def test_without_a_reference_only_what_was_delivered_is_reported(scene: ScenePaths) -> None:
+def test_without_a_reference_what_was_delivered_and_its_form_is_reported(scene: ScenePaths) -> None:
     measured = figures(evaluated(scene.truth))
-    assert {name.split(".")[0] for name in measured} == {"delivery", "validity"}
+    assert {name.split(".")[0] for name in measured} == {"delivery", "form", "validity"}
+    assert not any(name.startswith(("form.drawn", "form.corner_", "form.block")) for name in measured)
     assert measured["delivery.records_ok"] == 1.0
 
 
@@ -97,6 +98,9 @@ def test_true_roof_edges_can_be_the_reference(scene: ScenePaths, tmp_path: Path)
     (tmp_path / "drawn.json").write_text(json.dumps(drawn))
     document = evaluated(scene.truth, "--wireframes", tmp_path / "drawn.json", "--out", tmp_path / "report")
     measured = {name: value for name, value in figures(document).items() if name.startswith("wireframes.")}
+    assert measured.pop("wireframes.board_corner_offset") == pytest.approx(0.0, abs=1e-9)
+    board = {name: measured.pop(name) for name in list(measured) if ".board_" in name}
+    assert board["wireframes.board_corner_precision"] == 1.0
     assert len(measured) == 21
     assert list(measured.values()) == pytest.approx([1.0] * 21)
     rows = pq.read_table(tmp_path / "report" / "wireframes.parquet").to_pylist()

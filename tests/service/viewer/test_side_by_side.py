@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 from chromium import Visit, at, at_rest, rows
-from playwright.sync_api import expect
+from playwright.sync_api import Route, expect
 from stocked_state import Stock
 
 pytestmark = [pytest.mark.slow]
@@ -63,3 +63,22 @@ def test_another_run_is_chosen_and_a_run_without_difference_says_so(visit: Open,
     page.wait_for_selector("canvas[data-ready]")
     expect(main).to_contain_text("No building differs above the limits.")
     expect(page).to_have_url(f"{url}#/changes?old={stock.done}&new={stock.done}")
+
+
+def test_runs_of_two_versions_say_so_before_what_differs(visit: Open, stocked: Stocked, tmp_path: Path) -> None:
+    url, stock = stocked
+    opened = at(visit, url, "#/jobs")
+    page = opened.page
+    versions = iter(["0.2.0", "0.3.0"])
+
+    def answer(route: Route) -> None:
+        response = route.fetch()
+        route.fulfill(response=response, json=response.json() | {"engine_version": next(versions)})
+
+    page.route("**/results/report", answer)
+    page.goto(f"{url}#/changes?old={stock.done}&new={stock.done}")
+    page.wait_for_selector("canvas[data-ready]")
+    main = page.get_by_role("main")
+    expect(main).to_contain_text("The versions differ: left is of 0.2.0, right of 0.3.0.")
+    expect(main).to_contain_text("Outlines and roofs may be drawn anew where nothing was built.")
+    page.screenshot(path=tmp_path / "two_versions.png", full_page=True)

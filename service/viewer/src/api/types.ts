@@ -96,6 +96,10 @@ export interface Crs extends Units {
 /** The part of the report that the page reads. */
 export interface RunReport {
   crs?: Crs;
+  /** What made the run. */
+  engine_version?: string;
+  method?: string;
+  settings_hash?: string;
   counts?: Record<string, number>;
   timings_s?: Record<string, number>;
   warnings?: string[];

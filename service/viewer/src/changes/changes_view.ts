@@ -6,7 +6,7 @@ import { titleOf, whenWords } from "../jobs/job_words";
 import type { Batch, Gathered, Listed } from "../models/batching";
 import { originInMetres } from "../models/building_mesh";
 import { figureWords } from "../models/figures";
-import { CHANGES, LIMITS, pairs, type Change, type Pair, type Placed } from "../models/pairing";
+import { CHANGES, LIMITS, makersNote, pairs, type Change, type Pair, type Placed } from "../models/pairing";
 import { RunObjects } from "../models/run_objects";
 import { countOf } from "../models/selection";
 import { hashOf, partsOf, type Address } from "../page/address";
@@ -184,7 +184,8 @@ class Changes implements View {
       );
       return;
     }
-    this.note.replaceChildren();
+    const note = makersNote(before.objects.report, after.objects.report);
+    this.note.replaceChildren(...(note === null ? [] : [warningNotice(note)]));
     const shift = shiftOf(before, after);
     this.found = sorted(pairs(placed(before, [0, 0]), placed(after, shift)));
     this.draw([before, after], shift);

@@ -230,3 +230,17 @@ def test_a_like_object_that_the_other_epoch_rejected_leaves_it_open(compare: Com
         "b": "gone",
         "c": "gone",
     }
+
+
+@pytest.mark.parametrize("other", [{"engine_version": "9"}, {"method": "kmeans"}, {"settings_hash": "cd"}])
+def test_another_version_is_a_doubt_of_shapes_alone(compare: Compare, other: dict[str, str]) -> None:
+    old = [house("a1"), house("b1", 40.0), house("c1", 80.0)]
+    new = [house("a2", length=18.0), house("b2", 40.0, eave=8.0), house("c2", 80.0), house("d2", 120.0)]
+    rows = compare(old, new, of_new=other)
+    assert {name: (row["change"], row["doubts"]) for name, row in rows.items()} == {
+        "a": ("reshaped", ["other_version"]),
+        "b": ("raised", []),
+        "c": ("unchanged", []),
+        "d": ("new", []),
+    }
+    assert compare(old, new)["a"]["doubts"] == []

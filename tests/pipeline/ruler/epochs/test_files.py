@@ -145,6 +145,7 @@ def test_other_settings_methods_and_versions_give_warnings(tmp_path: Path) -> No
     found = run((str(old), str(new)), tmp_path / "out")
     assert "the settings differ: [roof] x 1.0 / 2.0" in found["warnings"]
     assert "the versions differ: OLD is of 0, NEW of 9" in found["warnings"]
+    assert any(warning.startswith("other versions and settings may draw outlines") for warning in found["warnings"])
     other = write_epoch(tmp_path / "other", [house("a2")], method="kmeans", request={"footprints": "f.gpkg"})
     found = run((str(old), str(other)), tmp_path / "out2")
     assert any("methods differ: OLD is of arrangement, NEW of kmeans" in warning for warning in found["warnings"])

@@ -122,6 +122,20 @@ def test_the_page_holds_all_that_it_shows(pair: tuple[Path, Path]) -> None:
     assert "min_height_change_m" in read.texts
 
 
+def test_a_new_version_is_named_on_the_page_in_the_tables_and_at_each_reshaped_building(tmp_path: Path) -> None:
+    old = write_epoch(tmp_path / "old", [house("a1"), house("b1", 40.0)], engine_version="0.2.0")
+    new = write_epoch(tmp_path / "new", [house("a2", length=18.0), house("b2", 40.0)], engine_version="0.3.0")
+    text = page(*compared_on_a_map(old, new))
+    assert "the versions differ: OLD is of 0.2.0, NEW of 0.3.0" in text
+    assert "may draw outlines and roofs anew where nothing was built" in text
+    assert "other version" in text.partition('data-change="reshaped"')[2].partition("</tr>")[0]
+    result = invoke(old, new, "--out", tmp_path / "changes")
+    assert "OLD is of 0.2.0, NEW of 0.3.0" in result.stderr
+    document = json.loads((tmp_path / "changes" / "changes.json").read_text())
+    assert document["doubts"] == {"other_version": 1}
+    assert document["changes"]["reshaped"]["without_doubt"] == 0
+
+
 def test_text_of_the_users_is_no_markup(tmp_path: Path) -> None:
     evil = dataclasses.replace(house("e2"), source_id="<script>alert(1)</script>")
     made, rows = compared_on_a_map(write_epoch(tmp_path / "o", []), write_epoch(tmp_path / "new", [evil]))

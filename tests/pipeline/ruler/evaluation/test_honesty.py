@@ -280,8 +280,8 @@ def test_a_broken_solid_costs_validity_alone(truth: ModelSet, reference: Referen
     assert value(found, "faces.completeness_10m2") == 1.0
 
 
-PERFECT_BUT_FOR_THE_SURVEY = "residuals."
-"""Points differ from the truth by noise, mixed echoes and the shifts of strips."""
+NOT_PERFECT = ("residuals.", "form.inner_short_edges")
+"""Points err by noise, mixed echoes and the shifts of strips. Chimneys and dormers have short sides."""
 
 
 @pytest.mark.slow
@@ -298,6 +298,6 @@ def test_the_truth_of_every_suite_is_perfect_against_itself(
     imperfect = {
         (measure.name, measure.subset): measure.value
         for measure in evaluate(read_models(folder), read_truth_reference(folder)).measures
-        if not measure.name.startswith(PERFECT_BUT_FOR_THE_SURVEY) and not is_perfect(measure)
+        if not measure.name.startswith(NOT_PERFECT) and not is_perfect(measure)
     }
     assert imperfect == {}

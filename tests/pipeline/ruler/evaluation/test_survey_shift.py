@@ -93,9 +93,9 @@ def test_a_scene_without_shifts_is_refused(shifted: Path, tmp_path: Path) -> Non
 
 def test_options_that_do_not_go_together_are_reported_at_once() -> None:
     with pytest.raises(SettingsError) as caught:
-        EvaluationRequest(models="run", footprints="f.gpkg", ground=("g.laz",), as_surveyed=True)
+        EvaluationRequest(models="run", footprints_layer="sheds", ground=("g.laz",), as_surveyed=True)
     text = str(caught.value)
-    assert "footprints are f.gpkg without points" in text
+    assert "the layer sheds is given without footprints" in text
     assert "as-surveyed is given without a truth" in text
     assert "ground is g.laz without a reference" in text
     with pytest.raises(SettingsError, match="use one of --truth and --points"):

@@ -56,8 +56,16 @@ def judged(models: list[RoofModel], wireframes: list[Wireframe], **more: Any) ->
 
 
 def figures(evaluation: Evaluation) -> dict[str, float]:
-    found = [one for one in evaluation.measures if one.name.startswith("wireframes.")]
-    return {one.name.removeprefix("wireframes."): one.value for one in found}
+    found = {
+        one.name.removeprefix("wireframes."): one.value for one in evaluation.measures if ".board_" not in one.name
+    }
+    return {name: value for name, value in found.items() if "." not in name}
+
+
+def board(evaluation: Evaluation) -> dict[str, float]:
+    """The figures of the Building3D board."""
+    found = [one for one in evaluation.measures if one.name.startswith("wireframes.board_")]
+    return {one.name.removeprefix("wireframes.board_"): one.value for one in found}
 
 
 def counts(models: list[RoofModel]) -> tuple[float, int]:
@@ -348,3 +356,43 @@ def test_nothing_there_and_empty_folders_are_refused(tmp_path: Path) -> None:
         read_wireframes(tmp_path / "w.json")
     with pytest.raises(InputError, match="no OBJ file"):
         read_wireframes(tmp_path)
+
+
+def test_the_board_sees_no_fault_in_the_same_roof() -> None:
+    found = board(judged([flat("a"), gable("b", 20.0)], [rectangle_at("a"), moved(gable_at("b"), 20.0)]))
+    assert found.pop("corner_offset") == pytest.approx(0.0, abs=1e-9)
+    assert found == pytest.approx(dict.fromkeys(found, 1.0))
+    assert len(found) == 6
+
+
+@pytest.mark.parametrize(
+    ("width", "right", "offset"),
+    # The farthest true corner is sqrt(41) m from the middle, so a tenth is 0.64 m.
+    [(10.6, 1.0, 0.3 / math.sqrt(41)), (10.7, 0.5, 0.0)],
+)
+def test_the_board_measures_relative_to_the_size_of_the_building(width: float, right: float, offset: float) -> None:
+    found = board(judged([flat("m", width=width)], [rectangle_at("a")]))
+    assert found["corner_precision"] == found["corner_recall"] == right
+    assert found["edge_f1"] == (1.0 if right == 1.0 else 0.25)  # else of the four edges the one at x = 0
+    assert found["corner_offset"] == pytest.approx(offset)
+
+
+def test_on_the_board_corners_may_be_right_without_their_edges() -> None:
+    cross = drawn("a", [(0, 0, 6), (10, 0, 6), (10, 8, 6), (0, 8, 6)], [(0, 2), (1, 3)])
+    found = board(judged([flat("m")], [cross]))
+    assert (found["edge_precision"], found["edge_recall"]) == (0.0, 0.0)
+    assert (found["corner_precision"], found["corner_recall"], found["corner_offset"]) == (1.0, 1.0, 0.0)
+
+
+def test_the_board_joins_stretches_that_go_straight_on() -> None:
+    ring = [(0, 0), (3, 0), (7, 0), (10, 0), (10, 8), (0, 8)]
+    found = board(judged([model("m", RoofType.FLAT, [surface(ring, (0.0, 0.0, 6.0))])], [rectangle_at("a")]))
+    assert (found["edge_precision"], found["edge_recall"], found["corner_precision"]) == (1.0, 1.0, 1.0)
+
+
+def test_on_the_board_a_building_without_a_model_costs_recall_alone() -> None:
+    found = board(judged([flat("m")], [rectangle_at("a"), moved(rectangle_at("b"), 50.0)]))
+    assert (found["edge_precision"], found["edge_recall"]) == (1.0, 0.5)
+    assert found["corner_f1"] == pytest.approx(2 / 3)
+    nothing = board(judged([], [rectangle_at("a")]))
+    assert (nothing["edge_recall"], nothing["edge_f1"], math.isnan(nothing["edge_precision"])) == (0.0, 0.0, True)
