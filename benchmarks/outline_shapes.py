@@ -112,7 +112,7 @@ def paired(some: FloatArray, others: FloatArray, tolerance_m: float) -> int:
 def closed(outlines: Iterable[shapely.Geometry]) -> shapely.Geometry:
     """Areas as one, without the small gaps between them."""
     wide = shapely.union_all(shapely.buffer(list(outlines), GAP_M, join_style="mitre"))
-    return shapely.buffer(wide, -GAP_M, join_style="mitre")
+    return shapely.make_valid(shapely.buffer(wide, -GAP_M, join_style="mitre"))
 
 
 def judged(
@@ -148,8 +148,8 @@ def judged(
     )
 
 
-def judged_run(run: Path, truth: Path, per_m2: float) -> Iterator[tuple[str, Judged]]:
-    """All buildings of a scene by their names; touching houses count as one."""
+def judged_run(run: Path, truth: Path, per_m2: float) -> Iterator[Judged]:
+    """All buildings of a scene; touching houses count as one."""
     rows = read_table(str(run), "buildings").to_pylist()
     rows = [row for row in rows if row["geometry"] and row["status"] != "failed"]
     plans = np.array([shapely.from_wkb(row["geometry"]) for row in rows], dtype=object)
@@ -158,7 +158,8 @@ def judged_run(run: Path, truth: Path, per_m2: float) -> Iterator[tuple[str, Jud
         true = closed(house.footprint for house in block)
         over = np.flatnonzero(shapely.area(shapely.intersection(plans, true)) > 0.5 * shapely.area(plans))
         sigmas = [NAN if (sigma := rows[k].get(SIGMA)) is None else sigma for k in over]
-        yield name, judged(true, list(plans[over]), sigmas, per_m2)
+        found = judged(true, list(plans[over]), sigmas, per_m2)
+        yield dataclasses.replace(found, shape=name.rpartition("-")[0], building=name, per_m2=per_m2)
 
 
 def measured(split: str, draws: int, out: Path, codes: dict[str, Path], jobs: int) -> list[Judged]:
@@ -175,11 +176,8 @@ def measured(split: str, draws: int, out: Path, codes: dict[str, Path], jobs: in
         if not (run / "run.json").exists():
             entry = Entry(name=folder.name, tiles=(folder / "outline_shapes.laz",), classes="ignore")
             run_survey(entry, variant, run, codes[code])
-        labels: dict[str, Any] = {"code": code, "per_m2": cell.density_per_m2}
-        return [
-            dataclasses.replace(found, shape=name.rpartition("-")[0], building=f"{draw}-{name}", **labels)
-            for name, found in judged_run(run, folder / "truth", cell.density_per_m2)
-        ]
+        found = judged_run(run, folder / "truth", cell.density_per_m2)
+        return [dataclasses.replace(row, code=code, building=f"{draw}-{row.building}") for row in found]
 
     with ThreadPoolExecutor(jobs) as pool:
         return [row for rows in pool.map(one, itertools.product(range(draws), CELLS, codes)) for row in rows]
@@ -202,12 +200,9 @@ def figures(rows: Sequence[Judged]) -> list[str]:
         return [f"0 of {len(rows)}", "0.000", "", "", "", ""]
     right, found, true = (sum(getattr(row, name) for row in seen) for name in ("right", "found", "true"))
     mean, median = np.mean([row.iou for row in rows]), np.median([row.iou for row in seen])
-    cells = [f"{len(seen)} of {len(rows)}", cell(mean), cell(median), cell(2 * right / (found + true) if true else NAN)]
-    return [
-        *cells,
-        f"{found / len(seen):.1f} / {true / len(seen):.1f}",
-        cell(np.nanmean([r.angle_deg for r in seen]), ".1f"),
-    ]
+    counts, angle = f"{found / len(seen):.1f} / {true / len(seen):.1f}", np.nanmean([row.angle_deg for row in seen])
+    f1 = cell(2 * right / (found + true) if true else NAN)
+    return [f"{len(seen)} of {len(rows)}", cell(mean), cell(median), f1, counts, cell(angle, ".1f")]
 
 
 def shape_table(rows: Sequence[Judged], code: str, baseline: str) -> str:
@@ -233,21 +228,12 @@ def sigma_cells(rows: Sequence[Judged]) -> list[str]:
     length, off, sigma = np.array([edge for row in rows for edge in row.edges]).reshape(-1, 3).T
     if not len(length):
         return ["0"] + [""] * (6 + len(QUANTILES))
-    distance, known = np.where(np.isfinite(off), np.abs(off), np.inf), np.isfinite(sigma)
-    within = (distance <= sigma)[known]
-    shares = (
-        [within.mean(), np.average(within, weights=length[known]), np.median(sigma[known])]
-        if known.any()
-        else [NAN] * 3
-    )
+    distance, known, shares = np.where(np.isfinite(off), np.abs(off), np.inf), np.isfinite(sigma), [NAN] * 3
+    if known.any():
+        within = (distance <= sigma)[known]
+        shares = [within.mean(), np.average(within, weights=length[known]), np.median(sigma[known])]
     spread = [*np.quantile(distance, QUANTILES, method="lower"), math.sqrt(np.nanmean(off**2))]
-    return [
-        str(len(off)),
-        cell(np.isnan(off).mean()),
-        *map(cell, shares),
-        f"{np.nanmedian(off):+.3f}",
-        *map(cell, spread),
-    ]
+    return [str(len(off)), *map(cell, (np.isnan(off).mean(), *shares, np.nanmedian(off), *spread))]
 
 
 def sigma_table(rows: Sequence[Judged]) -> str:

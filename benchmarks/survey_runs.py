@@ -44,9 +44,9 @@ def run_survey(entry: Entry, variant: Variant, out: Path, checkout: Path = ROOT)
     paths = [str(checkout), *filter(None, [os.environ.get("PYTHONPATH")])]  # before any installed code
     variables = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
     variables.pop("PYTHONDONTWRITEBYTECODE", None)  # a second run finds what the first compiled
-    before, began = _processor_s(), time.perf_counter()
+    before, began = processor_s(), time.perf_counter()
     reported = subprocess.run(command, env=variables, capture_output=True, text=True, check=False)
-    seconds = Seconds(processor=_processor_s() - before, clock=time.perf_counter() - began)
+    seconds = Seconds(processor=processor_s() - before, clock=time.perf_counter() - began)
     if reported.returncode:
         raise RuntimeError(
             f"{variant.label} on {entry.name} ended with {reported.returncode}: {reported.stderr[-600:]}"
@@ -54,7 +54,7 @@ def run_survey(entry: Entry, variant: Variant, out: Path, checkout: Path = ROOT)
     return seconds
 
 
-def _processor_s() -> float:
+def processor_s() -> float:
     """Processor seconds of all child processes that ended."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
