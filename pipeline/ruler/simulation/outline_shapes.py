@@ -44,17 +44,17 @@ _CIRCLE = 48
 """Corners of a round tower: it turns by less than 10 degrees at each."""
 
 Parts = list[RoofPart]
-_Flat: tuple[Line, ...] = ((0.0, 0.0, 0.0),)
+_FLAT: tuple[Line, ...] = ((0.0, 0.0, 0.0),)
 
 
-def _part(outline: tuple[Place, ...], planes: tuple[Line, ...] = _Flat) -> RoofPart:
+def _part(outline: tuple[Place, ...], planes: tuple[Line, ...] = _FLAT) -> RoofPart:
     return RoofPart(outline=outline, planes=planes, labels=tuple(f"face {k}" for k in range(len(planes))))
 
 
 def _gable(half_m: float, random: np.random.Generator, turn_deg: float = 0.0) -> tuple[Line, ...]:
     """No slope, or a ridge through the origin that falls over half_m to both sides; it is turned to the left."""
     if random.random() < 0.5:
-        return _Flat
+        return _FLAT
     slope, turn = math.tan(math.radians(random.uniform(15.0, 40.0))), math.radians(turn_deg)
     a, b, c = slope * math.sin(turn), slope * math.cos(turn), slope * half_m
     return (-a, b, c), (a, -b, c)
@@ -161,8 +161,8 @@ class _Planned:
         plan = turned(self.roof.vertices[:, :2], plot.x, plot.y, self.box.azimuth_deg)
         vertices = np.column_stack([plan, self.roof.vertices[:, 2] + around.eave_z_m])
         planes = tuple(face_plane(vertices[list(face[0])]) for face in self.roof.faces)
-        roof = {"vertices": vertices, "faces": self.roof.faces, "planes": planes, "groups": self.roof.groups}
-        return dataclasses.replace(around, **roof)
+        faces, groups = self.roof.faces, self.roof.groups
+        return dataclasses.replace(around, vertices=vertices, faces=faces, planes=planes, groups=groups)
 
 
 def _planned(shape: str, number: int, random: np.random.Generator) -> _Planned:
