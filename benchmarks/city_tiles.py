@@ -20,12 +20,10 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import laspy
-import numpy as np
 
-from pipeline.model import ByteArray
-from pipeline.ruler.simulation.als import ScanBlock, scan
+from pipeline.ruler.simulation.als import scan
 from pipeline.ruler.simulation.city import CITY_SCANNER, CityPlan, Extent
-from pipeline.ruler.simulation.survey_files import las_header
+from pipeline.ruler.simulation.survey_files import las_header, las_points
 
 SUFFIX = ".laz"
 
@@ -99,24 +97,11 @@ def make_row(city: CityTiles, row: int, out: Path) -> list[MadeTile]:
             with laspy.open(part, mode="w", header=header, do_compress=True) as writer:
                 # one thread: the processes are as many as there are cores
                 for block in scan(scene, settings, city.seed, chunk_points=250_000, threads=1):
-                    writer.write_points(_record(block, header))
+                    writer.write_points(las_points(block, header, with_classes=False))
                     count += len(block)
             part.replace(path)
         made.append(MadeTile(name=path.name, points=count, buildings=owned))
     return made
-
-
-def _record(block: ScanBlock, header: laspy.LasHeader) -> laspy.ScaleAwarePointRecord:
-    """A block as LAS points without classes."""
-    cloud = block.points
-    record = laspy.ScaleAwarePointRecord.zeros(len(block), header=header)
-    record.x, record.y, record.z = cloud.xyz[:, 0], cloud.xyz[:, 1], cloud.xyz[:, 2]
-    unclassified: ByteArray = np.ones(len(block), np.uint8)
-    record["return_number"], record["number_of_returns"] = cloud.return_number, cloud.return_count
-    record["classification"], record["intensity"] = unclassified, block.intensity
-    record["scan_angle"] = np.round(block.scan_angle_deg / 0.006).astype(np.int16)
-    record["point_source_id"], record["gps_time"] = cloud.source_id, cloud.gps_time
-    return record
 
 
 def make_city(city: CityTiles, out: Path, processes: int) -> list[MadeTile]:

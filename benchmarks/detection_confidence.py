@@ -66,11 +66,7 @@ def fitted(candidates: Candidates) -> Weights:
     slope, start, most = _likeliest(candidates[candidates.is_model & ~candidates.is_block], has_ceiling=True)
     slope_rejected, start_rejected, _ = _likeliest(candidates[~candidates.is_model], has_ceiling=False)
     return Weights(
-        per_log_flatness=slope,
-        at_flatness_1=start,
-        most=most,
-        per_log_rough=slope_rejected,
-        at_no_rough=start_rejected,
+        per_log_flatness=slope, at_flatness_1=start, most=most, per_log_rough=slope_rejected, at_no_rough=start_rejected
     )
 
 

@@ -289,43 +289,25 @@ def tables(costs: Mapping[str, Any]) -> str:
     """What was measured, as tables."""
     rows = costs["rows"]
     heads = ["buildings", "files", "tiles", "tasks", "processor s", "µs per building", "peak, MB", "bytes per building"]
-    first = markdown_table(
-        heads,
+    lines = [
         [
-            [
-                *(str(row[name]) for name in ("buildings", "files", "tiles")),
-                str(sum(row["tasks"].values())),
-                f"{in_all(row):.1f}",
-                f"{1e6 * in_all(row) / row['buildings']:.0f}",
-                f"{row['peak_bytes'] / 1e6:.0f}",
-                f"{(row['peak_bytes'] - row['before_bytes']) / row['buildings']:.0f}",
-            ]
-            for row in rows
-        ],
-    )
-    last = rows[-1]
-    second = markdown_table(
-        [
-            "stage",
-            "tasks",
-            "before the first task, s",
-            "while tasks run, s",
-            "ms per task",
-            "task, bytes",
-            "brief, bytes",
-        ],
-        [
-            [
-                stage,
-                str(count),
-                f"{last['before_s'][stage]:.1f}",
-                f"{last['during_s'][stage]:.1f}",
-                f"{1e3 * (last['before_s'][stage] + last['during_s'][stage]) / count:.2f}",
-                *(f"{last[name].get(stage, 0):.0f}" for name in ("task_bytes", "brief_bytes")),
-            ]
-            for stage, count in last["tasks"].items()
-        ],
-    )
+            *(str(row[name]) for name in ("buildings", "files", "tiles")),
+            str(sum(row["tasks"].values())),
+            f"{in_all(row):.1f}",
+            f"{1e6 * in_all(row) / row['buildings']:.0f}",
+            f"{row['peak_bytes'] / 1e6:.0f}",
+            f"{(row['peak_bytes'] - row['before_bytes']) / row['buildings']:.0f}",
+        ]
+        for row in rows
+    ]
+    first, last, stages = markdown_table(heads, lines), rows[-1], []
+    for stage, count in last["tasks"].items():
+        before_s, during_s = last["before_s"][stage], last["during_s"][stage]
+        sizes = [f"{last[name].get(stage, 0):.0f}" for name in ("task_bytes", "brief_bytes")]
+        per_task_ms = f"{1e3 * (before_s + during_s) / count:.2f}"
+        stages.append([stage, str(count), f"{before_s:.1f}", f"{during_s:.1f}", per_task_ms, *sizes])
+    heads = ["stage", "tasks", "before the first task, s", "while tasks run, s", "ms per task"]
+    second = markdown_table([*heads, "task, bytes", "brief, bytes"], stages)
     return f"{first}\nThe largest of them, by stage:\n\n{second}\nA look at a file: {1e3 * costs['look_s']:.1f} ms.\n"
 
 

@@ -44,6 +44,7 @@ from pipeline.ruler.simulation.seeds import seed_of
 from pipeline.ruler.simulation.sweep import CELLS, Cell
 from pipeline.runtime.request import RunRequest
 from pipeline.runtime.resources import SERIAL
+from pipeline.runtime.run import run
 from pipeline.settings import RunSettings
 
 GROUND = "ground."
@@ -171,6 +172,12 @@ def tiles_of(entry: Entry, place: Workplace) -> tuple[str, ...]:
 def run_settings(entry: Entry) -> RunSettings:
     """The settings that find the candidates of an entry; those of the methods are their defaults."""
     return RunSettings.from_mapping({"classes": entry.classes})
+
+
+def modelled(tile: Path, out: Path, *, classes: str = "ignore", **options: Any) -> None:
+    """Model a file in this process, with default settings except for its classes; `options` are those of a request."""
+    settings = RunSettings.from_mapping({"classes": classes})
+    run(RunRequest(inputs=(str(tile),), out=str(out), settings=settings, resources=SERIAL, overwrite=True, **options))
 
 
 def measure_entry(entry: Entry, variants: Sequence[Variant], place: Workplace) -> None:

@@ -349,23 +349,9 @@ def harbour(random: np.random.Generator, density: float) -> Drawn:
 KINDS: dict[str, Callable[[np.random.Generator, float], Drawn]] = {
     scene.__name__: scene
     for scene in (
-        hills_and_halls,
-        halls_at_the_edge,
-        river_with_bridges,
-        houses_on_a_slope,
-        quarry,
-        embankments,
-        forest_on_a_slope,
-        old_town,
-        low_outliers,
-        terraces,
-        gaps,
-        embankment_with_bridges,
-        deep_cutting,
-        vineyard,
-        castle_on_a_rock,
-        dyke,
-        harbour,
+        hills_and_halls, halls_at_the_edge, river_with_bridges, houses_on_a_slope, quarry, embankments,
+        forest_on_a_slope, old_town, low_outliers, terraces, gaps, embankment_with_bridges, deep_cutting, vineyard,
+        castle_on_a_rock, dyke, harbour,
     )
-}
+}  # fmt: skip
 """The scenes by name."""

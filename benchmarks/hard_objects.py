@@ -17,16 +17,12 @@ from pathlib import Path
 import numpy as np
 import shapely
 
-from benchmarks.entries import markdown_table
+from benchmarks.entries import markdown_table, modelled
 from pipeline.ruler.evaluation.reading import read_models
 from pipeline.ruler.simulation.bridges_and_vans import BRIDGES
 from pipeline.ruler.simulation.dataset import simulate
 from pipeline.ruler.simulation.seeds import seed_of
 from pipeline.ruler.simulation.suites import suite_named
-from pipeline.runtime.request import RunRequest
-from pipeline.runtime.resources import SERIAL
-from pipeline.runtime.run import run
-from pipeline.settings import RunSettings
 
 DECK_SHARE = 0.2
 """A fifth of a deck is a house in the middle of the bridge."""
@@ -39,10 +35,8 @@ def covered(suite: str, split: str, draw: int, out: Path) -> list[float]:
     scene, folder = plan.make(seed, plan.size_m), out / suite / f"{split}{draw}"
     if not (folder / "truth" / "scene.json").exists():
         simulate(suite, folder, seed)
-    tile, run_dir = str(folder / f"{suite}.laz"), str(folder / "run")
-    settings = RunSettings.from_mapping({"classes": "ignore"})
-    run(RunRequest(inputs=(tile,), out=run_dir, settings=settings, resources=SERIAL, meshes="none", overwrite=True))
-    outlines = shapely.union_all([model.footprint for model in read_models(run_dir).models])
+    modelled(folder / f"{suite}.laz", folder / "run", meshes="none")
+    outlines = shapely.union_all([model.footprint for model in read_models(folder / "run").models])
     halls = [one.footprint for one in scene.buildings if one.building_id.startswith("hall")]
     local = [shapely.Polygon(box.corners) for box in scene.boxes] or halls
     inside = [shapely.intersection(one, shapely.box(*scene.extent)) for one in local]

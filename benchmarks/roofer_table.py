@@ -134,11 +134,7 @@ def measure(
     for name, survey in sparser.items():
         reported(variant, survey, run_survey(survey, variant, place.run(variant, survey)))
         scores[name] = score_run(place.run(variant, survey), reference, val3dity)
-    return Figures(
-        whole=whole,
-        warm=warm,
-        thinned=scores,
-    )
+    return Figures(whole=whole, warm=warm, thinned=scores)
 
 
 def reported(variant: Variant, entry: Entry, seconds: Seconds) -> None:

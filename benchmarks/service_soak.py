@@ -1,17 +1,13 @@
-"""Many clients for minutes, also while parts of the service fail: what is lost or doubled, how long a call takes.
+"""Many clients for minutes: what is lost or doubled, how long a call takes.
 
-    python -m benchmarks.service_soak [--minutes 10] [--pollers 500] [--uploads 50] [--kill-driver-every 20]
-        [--fill-disk] [--lock-database] [--state DIR] [--tile FILE] [--megabytes 20]
+    python -m benchmarks.service_soak [--minutes 10] [--pollers 500] [--uploads 50] [--state DIR] [--tile FILE]
+        [--megabytes 20]
 
 Each of the clients that upload sends the tile with an Idempotency-Key, waits until its job has ended and begins again;
 an answer that is lost is asked for again with the same key. As soon as there is a job, the others ask for the status
 of one once a second. Jobs model a small window of the tile, so that the service, not the modelling, is under load.
-
-`--kill-driver-every` sends SIGKILL to the driver. `--lock-database` holds an exclusive lock for the first 10 s of each
-minute, and `--fill-disk` writes to the last byte of the disk that `--state` lies on for 10 s from the middle of each
-minute: put it on a small file system of its own. When the time is over, all jobs must end, each exactly once. Every
-refusal must be a problem document that says when to come again, and the API process must stay below 250 MiB. Without
-any of the three options it measures load alone.
+When the time is over, all jobs must end, each exactly once. Every refusal must be a problem document that says when to
+come again, and the API process must stay below 250 MiB. The tests of the service let its parts fail.
 """
 
 from __future__ import annotations
@@ -24,26 +20,24 @@ import dataclasses
 import json
 import multiprocessing
 import os
+import re
 import signal
-import sqlite3
 import statistics
+import subprocess
 import sys
 import tempfile
-import threading
 import time
 import uuid
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import httpx
 import laspy
 import numpy as np
-import psutil  # type: ignore[import-untyped]
-
-from benchmarks.service_process import Poller, cpu_s, peak_mib, serving
 
 TILE = Path(__file__).resolve().parents[2] / "shared" / "data" / "ahn3" / "delft_east.laz"
 MAX_API_MIB = 250.0
@@ -51,13 +45,68 @@ MAX_API_MIB = 250.0
 PAUSE_S = 1.0
 """Seconds that a poller waits between two calls."""
 POINTS_IN_WINDOW = 8_000
-FAULT_S = 10.0
-"""How long the database is locked and the disk is full, in each minute."""
 LAST_JOBS_S = 900.0
-"""How long the last jobs may take when nothing fails any more."""
+"""How long the last jobs may take."""
 LATER = {409, 429, 503, 507}
 """Refusals that pass; 409 while the first of two requests with one key is under way."""
 GOES_ON = {"accepted", "running"}
+
+
+@contextlib.contextmanager
+def serving(state: Path, *options: str) -> Iterator[tuple[str, int]]:
+    """URL and process id of a service."""
+    # all clients share an address here: the limits of one address are not what is measured
+    limits = {"GABLEWORK_RATE_LIMIT": "1000000/minute", "GABLEWORK_MAX_CONNECTIONS_PER_ADDRESS": "10000"}
+    environment = os.environ | limits | {"GABLEWORK_DRAIN_S": "0"}
+    command = [sys.executable, "-m", "service.cli", "serve", "--json", "--port", "0", "--state", str(state), *options]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as process:
+        assert process.stdout is not None
+        reported = ""
+        while not reported.rstrip().endswith("}"):
+            line = process.stdout.readline()
+            if not line:
+                raise SystemExit(f"serve ended with {process.wait()}")
+            reported += line
+        try:
+            yield json.loads(reported)["url"], process.pid
+        finally:
+            process.send_signal(signal.SIGTERM)
+
+
+def peak_mib(pid: int) -> tuple[float, float]:
+    """Resident memory of a process in MiB: now, and at its highest."""
+    status = Path(f"/proc/{pid}/status").read_text()
+    now, peak = (int(re.search(rf"{name}:\s+(\d+) kB", status)[1]) / 1024 for name in ("VmRSS", "VmHWM"))  # type: ignore[index]
+    return now, peak
+
+
+def cpu_s(pid: int) -> float:
+    """Processor seconds that a process took so far."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+class Poller:
+    """One client with one connection, written by hand: hundreds of them must not be what is measured."""
+
+    def __init__(self, url: str) -> None:
+        self._host = urlsplit(url)
+        self._streams: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
+
+    async def get(self, path: str) -> int:
+        """The status of an answer, once all of it is here."""
+        if self._streams is None:
+            self._streams = await asyncio.open_connection(self._host.hostname, self._host.port)
+        reader, writer = self._streams
+        writer.write(f"GET {path} HTTP/1.1\r\nHost: {self._host.netloc}\r\n\r\n".encode())
+        head = (await reader.readuntil(b"\r\n\r\n")).decode().lower()
+        await reader.readexactly(int(head.partition("content-length: ")[2].partition("\r\n")[0]))
+        return int(head.split(" ", 2)[1])
+
+    def close(self) -> None:
+        """Close the connection."""
+        if self._streams is not None:
+            self._streams[1].close()
 
 
 def large_tile(source: Path, folder: Path, megabytes: int) -> tuple[Path, str]:
@@ -233,75 +282,6 @@ def _upload_all(url: str, tile: Path, bbox: str, current: Connection, seconds: f
     return uploading.seen
 
 
-def every(seconds: float, first: float, over: threading.Event, action: Callable[[], None]) -> threading.Thread:
-    """Do something again and again in a thread, until it is over."""
-
-    def again() -> None:
-        if over.wait(first):
-            return
-        while True:
-            began = time.monotonic()
-            action()
-            if over.wait(max(0.0, seconds - (time.monotonic() - began))):
-                return
-
-    thread = threading.Thread(target=again)
-    thread.start()
-    return thread
-
-
-def kill_driver(pid: int, killed: list[float]) -> None:
-    """SIGKILL to the driver of a service."""
-    for child in psutil.Process(pid).children():
-        with contextlib.suppress(psutil.NoSuchProcess):
-            if "driver" in " ".join(child.cmdline()):
-                child.send_signal(signal.SIGKILL)
-                killed.append(time.monotonic())
-
-
-def lock_database(path: Path) -> None:
-    """Hold the database's lock for a while."""
-    with contextlib.closing(sqlite3.connect(path, timeout=60.0, isolation_level=None)) as connection:
-        connection.execute("BEGIN EXCLUSIVE")
-        time.sleep(FAULT_S)
-        connection.execute("ROLLBACK")
-
-
-def fill_disk(filler: Path) -> None:
-    """Leave no byte free for a while."""
-    try:
-        with filler.open("wb") as stream:
-            size = 0
-            for step in (1 << 30, 1 << 20, 1 << 12):
-                with contextlib.suppress(OSError):
-                    while True:
-                        os.posix_fallocate(stream.fileno(), size, step)
-                        size += step
-            time.sleep(FAULT_S)
-    finally:
-        filler.unlink()
-
-
-@contextlib.contextmanager
-def failing(options: argparse.Namespace, pid: int, state: Path) -> Iterator[list[float]]:
-    """Faults for as long as the block lasts; yields the times at which drivers were killed."""
-    over, killed = threading.Event(), list[float]()
-    threads = []
-    if options.kill_driver_every:
-        seconds = options.kill_driver_every
-        threads.append(every(seconds, seconds, over, lambda: kill_driver(pid, killed)))
-    if options.lock_database:
-        threads.append(every(60.0, 0.0, over, lambda: lock_database(state / "service.db")))
-    if options.fill_disk:
-        threads.append(every(60.0, 30.0, over, lambda: fill_disk(state.parent / "filler")))
-    try:
-        yield killed
-    finally:
-        over.set()
-        for thread in threads:
-            thread.join()
-
-
 def ended(url: str, jobs: list[str]) -> tuple[Counter[str], list[str]]:
     """How all jobs ended, and what is lost or doubled."""
     until = time.monotonic() + LAST_JOBS_S
@@ -328,25 +308,20 @@ def ended(url: str, jobs: list[str]) -> tuple[Counter[str], list[str]]:
 
 
 def main() -> int:
-    """Load a service and let it fail; 1 if something is lost, doubled, too large or refused without a reason."""
+    """Load a service; 1 if something is lost, doubled, too large or refused without a reason."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--pollers", type=int, default=500)
     parser.add_argument("--uploads", type=int, default=50)
-    parser.add_argument("--kill-driver-every", type=float, default=0.0, metavar="S")
-    parser.add_argument("--fill-disk", action="store_true")
-    parser.add_argument("--lock-database", action="store_true")
     parser.add_argument("--state", type=Path, help="a folder for everything; default a temporary one")
     parser.add_argument("--tile", type=Path, default=TILE)
     parser.add_argument("--megabytes", type=int, default=20)
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="gablework-soak-", dir=options.state) as folder:
         tile, bbox = large_tile(options.tile, Path(folder), options.megabytes)
-        state = Path(folder) / "state"
-        with serving(state) as (url, pid):
+        with serving(Path(folder) / "state") as (url, pid):
             cpu_before_s = cpu_s(pid)
-            with failing(options, pid, state) as killed:
-                uploading, polling = clients(url, tile, bbox, options)
+            uploading, polling = clients(url, tile, bbox, options)
             api_cpu_s = cpu_s(pid) - cpu_before_s
             _, peak = peak_mib(pid)
             ends, faults = ended(url, uploading.jobs)
@@ -358,7 +333,6 @@ def main() -> int:
     figures = {
         "machine": f"{os.cpu_count()} cores",
         "jobs": f"{len(uploading.jobs)} with {tile.name} of {options.megabytes} MB: {json.dumps(dict(ends))}",
-        "drivers killed": str(len(killed)),
         "longest upload, with its refusals": f"{max(uploading.uploads_s):.1f} s",
         "status calls": f"{len(polling.calls_s)} of {options.pollers} pollers in {options.minutes:g} min",
         "status p50, p95, p99, max": f"{', '.join(f'{1e3 * s:.0f}' for s in spread)} ms",

@@ -16,7 +16,6 @@ import argparse
 import ctypes
 import dataclasses
 import os
-import resource
 import shutil
 import statistics
 import subprocess
@@ -26,8 +25,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from benchmarks.entries import markdown_table
+from benchmarks.survey_runs import ROOT, processor_s
 
-ROOT = Path(__file__).resolve().parents[1]
 _PR_SET_CHILD_SUBREAPER = 36
 
 IMPORT = "import pipeline.runtime.run"
@@ -89,7 +88,7 @@ def cost(command: list[str], folder: Path, environment: dict[str, str] | None = 
     """
     variables = {**os.environ, **(environment or {})}
     variables.pop("PYTHONDONTWRITEBYTECODE", None)
-    before, began = _processor_s(), time.perf_counter()
+    before, began = processor_s(), time.perf_counter()
     done = subprocess.run(command, cwd=folder, env=variables, capture_output=True, text=True, check=False)
     wall_s = time.perf_counter() - began
     while True:
@@ -99,12 +98,7 @@ def cost(command: list[str], folder: Path, environment: dict[str, str] | None = 
             break
     if done.returncode:
         raise RuntimeError(f"{command} in {folder} ended with {done.returncode}: {done.stderr[-2000:]}")
-    return Cost(_processor_s() - before, wall_s, done.stdout)
-
-
-def _processor_s() -> float:
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime
+    return Cost(processor_s() - before, wall_s, done.stdout)
 
 
 def program(checkout: Path, *words: str) -> list[str]:

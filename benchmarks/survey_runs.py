@@ -16,7 +16,8 @@ from pipeline.extras.compare.compare import Variant
 from pipeline.model import Candidate
 from pipeline.settings import RunSettings
 
-_ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[1]
+"""This checkout."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -29,23 +30,23 @@ class Seconds:
     """Wall-clock time."""
 
 
-def run_survey(entry: Entry, variant: Variant, out: Path) -> Seconds:
-    """Run the command line on a survey in a process of its own, with `out` overwritten; RuntimeError if it fails.
+def run_survey(entry: Entry, variant: Variant, out: Path, checkout: Path = ROOT) -> Seconds:
+    """Run the command line of a checkout on a survey in a process of its own, with `out` overwritten.
 
-    Nothing else may be started meanwhile: its processor seconds are those of all child processes.
+    RuntimeError if it fails. The processor seconds are those of all child processes that end meanwhile.
     """
     python = os.environ.get("GABLEWORK_PYTHON", sys.executable)
-    command = [python, "-m", "service.cli", "reconstruct", *map(str, entry.tiles), "--out", str(out)]
+    command = [python, "-P", "-m", "service.cli", "reconstruct", *map(str, entry.tiles), "--out", str(out)]
     command += ["--method", variant.method, "--preset", variant.preset, "--classes", entry.classes]
     command += ["--workers", "0", "--meshes", "none", "--overwrite", "--quiet"]
     command += [] if entry.crs is None else ["--crs", entry.crs]
     command += [] if entry.footprints is None else ["--footprints", str(entry.footprints)]
-    paths = [str(_ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]  # the code that this file belongs to
+    paths = [str(checkout), *filter(None, [os.environ.get("PYTHONPATH")])]  # before any installed code
     variables = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
     variables.pop("PYTHONDONTWRITEBYTECODE", None)  # a second run finds what the first compiled
-    before, began = _processor_s(), time.perf_counter()
+    before, began = processor_s(), time.perf_counter()
     reported = subprocess.run(command, env=variables, capture_output=True, text=True, check=False)
-    seconds = Seconds(processor=_processor_s() - before, clock=time.perf_counter() - began)
+    seconds = Seconds(processor=processor_s() - before, clock=time.perf_counter() - began)
     if reported.returncode:
         raise RuntimeError(
             f"{variant.label} on {entry.name} ended with {reported.returncode}: {reported.stderr[-600:]}"
@@ -53,7 +54,7 @@ def run_survey(entry: Entry, variant: Variant, out: Path) -> Seconds:
     return seconds
 
 
-def _processor_s() -> float:
+def processor_s() -> float:
     """Processor seconds of all child processes that ended."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime

@@ -41,7 +41,7 @@ import pyproj
 import shapely
 from laspy.vlrs.known import WktCoordinateSystemVlr
 
-from benchmarks.entries import markdown_table
+from benchmarks.entries import markdown_table, modelled
 from benchmarks.trust_judge import Truth, top_of
 from pipeline.export.geoparquet import read_table
 from pipeline.model import Status
@@ -50,10 +50,6 @@ from pipeline.ruler.simulation.dataset import simulate
 from pipeline.ruler.simulation.seeds import seed_of
 from pipeline.ruler.simulation.sweep import Cell
 from pipeline.ruler.simulation.trust import CELLS, KINDS
-from pipeline.runtime.request import RunRequest
-from pipeline.runtime.resources import SERIAL
-from pipeline.runtime.run import run
-from pipeline.settings import RunSettings
 
 TOLERANCE_M, SPARSE_TOLERANCE_M, SPARSE_PER_M2 = 0.2, 0.4, 2.0
 FOOT_M = 0.3048
@@ -186,17 +182,7 @@ def run_cell(task: tuple[Cell, Path, int, bool]) -> list[Judged]:
         write_in_feet(place / "trust.laz", laz)
     for classes in ("ignore", "trust") if cell.with_classes else ("ignore",):
         out = place / f"models-{classes}{'-feet' if in_feet else ''}"
-        settings = RunSettings.from_mapping({"classes": classes})
-        run(
-            RunRequest(
-                inputs=(str(laz),),
-                out=str(out),
-                settings=settings,
-                resources=SERIAL,
-                meshes="none",
-                overwrite=True,
-            )
-        )
+        modelled(laz, out, classes=classes, meshes="none")
         found.append(judge_run(out, place / "truth", cell, classes, draw, in_feet=in_feet))
     return found
 

@@ -109,21 +109,11 @@ KINDS: tuple[Kind, ...] = (
         files=("tile.copc.laz",),
         arguments=_run("tile.copc.laz", "--bbox", "400000", "5650000", "400039", "5650029"),
     ),
+    Kind(name="ply", files=("tile.ply", "text.ply"), arguments=_run("{file}", "--crs", CRS)),
     Kind(
-        name="ply",
-        files=("tile.ply", "text.ply"),
-        arguments=_run("{file}", "--crs", CRS),
+        name="geojson", files=("footprints.geojson",), arguments=_run("tile.laz", "--footprints", "footprints.geojson")
     ),
-    Kind(
-        name="geojson",
-        files=("footprints.geojson",),
-        arguments=_run("tile.laz", "--footprints", "footprints.geojson"),
-    ),
-    Kind(
-        name="geopackage",
-        files=("footprints.gpkg",),
-        arguments=_run("tile.laz", "--footprints", "footprints.gpkg"),
-    ),
+    Kind(name="geopackage", files=("footprints.gpkg",), arguments=_run("tile.laz", "--footprints", "footprints.gpkg")),
     Kind(
         name="shapefile",
         files=tuple(f"footprints.{ending}" for ending in ("shp", "shp", "dbf", "shx", "prj", "cpg")),
@@ -134,16 +124,8 @@ KINDS: tuple[Kind, ...] = (
         files=("footprints.parquet",),
         arguments=_run("tile.laz", "--footprints", "footprints.parquet"),
     ),
-    Kind(
-        name="overrides",
-        files=("overrides.toml",),
-        arguments=_run("tile.laz", "--overrides", "overrides.toml"),
-    ),
-    Kind(
-        name="guides",
-        files=("guides.geojson", "guides.gpkg"),
-        arguments=_run("tile.laz", "--guides", "{file}"),
-    ),
+    Kind(name="overrides", files=("overrides.toml",), arguments=_run("tile.laz", "--overrides", "overrides.toml")),
+    Kind(name="guides", files=("guides.geojson", "guides.gpkg"), arguments=_run("tile.laz", "--guides", "{file}")),
     Kind(name="batch", files=("batch.toml",), arguments=("batch", "run", "batch.toml", "--quiet", "--json")),
 )
 """All kinds, in the order of the table."""

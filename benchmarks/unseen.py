@@ -3,9 +3,8 @@
     python -m benchmarks.unseen --out DIR [--data ../shared/data] [--only ground classes forest wireframes]
                                 [--kept-aside] [--page docs/results/unseen.md]
 
-Kept aside are the ISPRS samples 22 and 42, the eastern half of `sparse_0382`, and the Tallinn buildings at odd
-positions in the sorted list of their ids. Without `--kept-aside` they are cut off before anything is computed; with it
-only they are measured. The commands run as a user runs them, with the default settings, classes ignored.
+Kept aside are the ISPRS samples 22 and 42. Without `--kept-aside` they are never read; with it only they are measured.
+The commands run as a user runs them, with the default settings, classes ignored.
 """
 
 from __future__ import annotations
@@ -13,18 +12,17 @@ from __future__ import annotations
 import argparse
 import collections
 import dataclasses
-import json
+import itertools
 import statistics
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import laspy
 import numpy as np
 import shapely
 
-from benchmarks.entries import fill_page, markdown_table
+from benchmarks.entries import fill_page, markdown_table, modelled
 from benchmarks.ground import DATA, measured, product_filter, samples
 from benchmarks.thinned_surveys import thinned, write_changed
 from pipeline.export.geoparquet import read_table
@@ -33,9 +31,7 @@ from pipeline.model import BoolArray, Status
 from pipeline.ruler.evaluation.evaluate import evaluate
 from pipeline.ruler.evaluation.reading import read_models
 from pipeline.ruler.evaluation.reading.wireframe_files import read_wireframes
-from pipeline.runtime.request import RunRequest
 from pipeline.runtime.resources import SERIAL
-from pipeline.runtime.run import run
 from pipeline.scene import BUILDING_CLASS
 from pipeline.settings import RunSettings
 from pipeline.terrain.terrain_settings import GroundSettings
@@ -92,13 +88,6 @@ class ClassScore:
         return [name, str(self.true), *(f"{share:.3f}" for share in self.shares)]
 
 
-def half_of(las: laspy.LasData, *, eastern: bool) -> laspy.LasData:
-    """The points east, or west, of the middle of the extent."""
-    x = np.asarray(las.x)
-    las.points = las.points[(x >= 0.5 * (x.min() + x.max())) == eastern]
-    return las
-
-
 def judged_points(name: str, las: laspy.LasData) -> BoolArray:
     """The points to compare: all except those in a building that the file leaves unclassified."""
     place = UNJUDGED.get(name)
@@ -131,22 +120,18 @@ def thinned_to(per_m2: float) -> Callable[[laspy.LasData], laspy.LasData]:
     return change
 
 
-def class_tables(data: Path, out: Path, *, kept_aside: bool) -> str:
+def class_table(data: Path, out: Path) -> str:
     """Class 6 per point."""
-    work = out / "classes"
-    side = "eastern" if kept_aside else "western"
-    (half,) = write_changed([data / SPARSE], work / "half", lambda las: half_of(las, eastern=kept_aside))
-    rows = [class_score("", half, IGN_CRS, work / "found").row(f"sparse_0382, {side} half")]
-    if not kept_aside:
-        rows = [class_score(t.name, data / t.file, t.crs, work / "found").row(t.name) for t in TILES] + rows
-        sparse: list[ClassScore] = []
-        for per_m2 in THINNED_PER_M2:
-            for tile in TILES:
-                (path,) = write_changed([data / tile.file], work / f"{per_m2:g}", thinned_to(per_m2))
-                sparse.append(class_score(tile.name, path, tile.crs, work / "found"))
-                rows.append(sparse[-1].row(f"{tile.name}, {per_m2:g} per m2"))
-        means = [statistics.fmean(column) for column in zip(*(score.shares for score in sparse), strict=True)]
-        rows.append(["**mean of the thinned**", "", *(f"**{mean:.3f}**" for mean in means)])
+    found = out / "classes" / "found"
+    rows = [class_score(t.name, data / t.file, t.crs, found).row(t.name) for t in TILES]
+    rows.append(class_score("", data / SPARSE, IGN_CRS, found).row("sparse_0382"))
+    sparse: list[ClassScore] = []
+    for per_m2, tile in itertools.product(THINNED_PER_M2, TILES):
+        (path,) = write_changed([data / tile.file], out / "classes" / f"{per_m2:g}", thinned_to(per_m2))
+        sparse.append(class_score(tile.name, path, tile.crs, found))
+        rows.append(sparse[-1].row(f"{tile.name}, {per_m2:g} per m2"))
+    means = [statistics.fmean(column) for column in zip(*(score.shares for score in sparse), strict=True)]
+    rows.append(["**mean of the thinned**", "", *(f"**{mean:.3f}**" for mean in means)])
     return markdown_table(["tile", "points of class 6", "IoU", "recall", "precision"], rows)
 
 
@@ -163,64 +148,25 @@ def forest_table(data: Path, out: Path) -> str:
     """What a forest without buildings becomes."""
     rows = []
     for classes in ("ignore", "trust"):
-        settings = RunSettings.from_mapping({"classes": classes})
         place = out / "forest" / classes
-        run(
-            RunRequest(
-                inputs=(str(data / FOREST),), out=str(place), settings=settings, crs=IGN_CRS, resources=SERIAL,
-                overwrite=True,
-            )
-        )  # fmt: skip
+        modelled(data / FOREST, place, classes=classes, crs=IGN_CRS)
         status = collections.Counter(read_table(str(place), "buildings").column("status").to_pylist())
         rejected = read_table(str(place), "rejected").num_rows
         rows.append([classes, *(str(status[one]) for one in Status), str(rejected)])
     return markdown_table(["classes", *Status, "rejected"], rows)
 
 
-def tallinn_half(data: Path, out: Path, *, kept_aside: bool) -> Path:
-    """Points, outlines and wireframes of every second building; a point belongs to the nearest outline."""
-    source = data / TALLINN
-    drawn: dict[str, Any] = json.loads((source / "wireframes.json").read_text(encoding="utf-8"))
-    outlines: dict[str, Any] = json.loads((source / "outlines.geojson").read_text(encoding="utf-8"))
-    chosen = set(sorted(drawn)[int(kept_aside) :: 2])
-    place = out / "tallinn"
-    place.mkdir(parents=True, exist_ok=True)
-    features = outlines["features"]
-    owners = np.array([str(feature["properties"]["id"]) for feature in features])
-    tree = shapely.STRtree([shapely.geometry.shape(feature["geometry"]) for feature in features])
-    las = laspy.read(source / "tallinn.laz")
-    nearest = tree.nearest(shapely.points(np.asarray(las.x), np.asarray(las.y)))
-    las.points = las.points[np.isin(owners[nearest], sorted(chosen))]
-    las.write(place / "tallinn.laz")
-    outlines["features"] = [f for f, owner in zip(features, owners, strict=True) if owner in chosen]
-    (place / "outlines.geojson").write_text(json.dumps(outlines), encoding="utf-8")
-    (place / "wireframes.json").write_text(json.dumps({k: drawn[k] for k in sorted(chosen)}), encoding="utf-8")
-    return place
-
-
-def wireframe_rows(place: Path) -> Iterator[list[str]]:
-    """Edges and corners with outlines and without."""
+def wireframe_table(data: Path, out: Path) -> str:
+    """Roof edges and corners beside those that people drew, with outlines and without."""
+    place, rows = data / TALLINN, []
     wireframes = read_wireframes(place / "wireframes.json")
     for name, footprints in (("given", str(place / "outlines.geojson")), ("found", None)):
-        models = place / f"models-{name}"
-        run(
-            RunRequest(
-                inputs=(str(place / "tallinn.laz"),), out=str(models), footprints=footprints, crs=TALLINN_CRS,
-                resources=SERIAL, overwrite=True,
-            )
-        )  # fmt: skip
+        models = out / "tallinn" / f"models-{name}"
+        modelled(place / "tallinn.laz", models, classes="trust", footprints=footprints, crs=TALLINN_CRS)
         measures = {m.name: m for m in evaluate(read_models(models), wireframes=wireframes).measures}
         for what in ("edge", "corner"):
-            values = []
-            for tolerance in TOLERANCES:
-                found = measures[f"wireframes.{what}_f1_{tolerance}"]
-                values.append(f"{found.value:.3f} ({found.low:.2f} to {found.high:.2f})")
-            yield [name, f"{what}s, F1", *values]
-
-
-def wireframe_table(data: Path, out: Path, *, kept_aside: bool) -> str:
-    """Roof edges and corners beside those that people drew."""
-    rows = list(wireframe_rows(tallinn_half(data, out, kept_aside=kept_aside)))
+            found = [measures[f"wireframes.{what}_f1_{tolerance}"] for tolerance in TOLERANCES]
+            rows.append([name, f"{what}s, F1", *(f"{m.value:.3f} ({m.low:.2f} to {m.high:.2f})" for m in found)])
     return markdown_table(["outlines", "", "within 0.3 m", "0.5 m", "1 m"], rows)
 
 
@@ -228,14 +174,12 @@ def tables(data: Path, out: Path, only: Sequence[str], *, kept_aside: bool) -> I
     """Names and text of the tables."""
     made: dict[str, Callable[[], str]] = {
         "ground": lambda: ground_table(data, kept_aside=kept_aside),
-        "classes": lambda: class_tables(data, out, kept_aside=kept_aside),
+        "classes": lambda: class_table(data, out),
         "forest": lambda: forest_table(data, out),
-        "wireframes": lambda: wireframe_table(data, out, kept_aside=kept_aside),
+        "wireframes": lambda: wireframe_table(data, out),
     }
-    if kept_aside:
-        del made["forest"]
     for name, make in made.items():
-        if name in only:
+        if name in only and (name == "ground" or not kept_aside):
             yield f"{name}-{'unseen' if kept_aside else 'chosen'}.md", make()
 
 

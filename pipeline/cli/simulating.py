@@ -18,8 +18,8 @@ def simulate(
         str,
         typer.Argument(
             metavar="SUITE",
-            help="suburb, town, cube, hofmann310, sweep, city, low_buildings, bridges_and_vans, wide_halls, trust or "
-            "one of the roof shapes.",
+            help="suburb, town, cube, hofmann310, sweep, city, low_buildings, bridges_and_vans, wide_halls, "
+            "outline_shapes, trust or one of the roof shapes.",
         ),
     ],
     out: Annotated[str, typer.Option(metavar="DIR", help="The folder to write: LAZ tiles and the truth beside them.")],

@@ -17,6 +17,9 @@ from pipeline.ruler.simulation.hofmann310 import hofmann310
 from pipeline.ruler.simulation.low_buildings import CELLS as LOW_CELLS
 from pipeline.ruler.simulation.low_buildings import SCANNER as LOW_SCANNER
 from pipeline.ruler.simulation.low_buildings import low_buildings
+from pipeline.ruler.simulation.outline_shapes import CELLS as OUTLINE_CELLS
+from pipeline.ruler.simulation.outline_shapes import SCANNER as OUTLINE_SCANNER
+from pipeline.ruler.simulation.outline_shapes import outline_shapes
 from pipeline.ruler.simulation.roofs import FlatPart, RoofDimensions, RoofShape
 from pipeline.ruler.simulation.simulated_scene import Scene, Terrain, place_building, undulating_terrain
 from pipeline.ruler.simulation.strips import Returns
@@ -248,6 +251,15 @@ SUITES: dict[str, Suite] = {
             scanner=HALL_SCANNER,
             size_m=(HALLS_SIZE_M, HALLS_SIZE_M),
             is_sized=False,
+        ),
+        Suite(
+            name="outline_shapes",
+            summary="round, oblique, bent, trapezoid and ordinary buildings whose outlines must keep their form",
+            make=lambda seed, _: outline_shapes(seed),
+            scanner=OUTLINE_SCANNER,
+            size_m=(150.0, 500.0),
+            is_sized=False,
+            cells=OUTLINE_CELLS,
         ),
         Suite(
             name="trust",

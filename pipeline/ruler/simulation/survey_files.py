@@ -93,7 +93,7 @@ def write_points(
         pq.ParquetWriter(part_labels, LABELS, compression="zstd") as table,
     ):
         for block in blocks:
-            tile.write_points(_las_points(block, header, with_classes))
+            tile.write_points(las_points(block, header, with_classes))
             building = pa.DictionaryArray.from_arrays(pa.array(block.building, mask=block.building < 0), names)
             columns = [block.points.classification, building, block.face.astype(np.int16), block.mixed]
             table.write_table(pa.table(columns, schema=LABELS))
@@ -108,7 +108,7 @@ def write_points(
     return TileFiles(laz=laz, labels=labels, points=count, bounds=(x0, y0, x1, y1))
 
 
-def _las_points(block: ScanBlock, header: laspy.LasHeader, with_classes: bool) -> laspy.ScaleAwarePointRecord:
+def las_points(block: ScanBlock, header: laspy.LasHeader, with_classes: bool) -> laspy.ScaleAwarePointRecord:
     """A block as LAS points."""
     cloud = block.points
     record = laspy.ScaleAwarePointRecord.zeros(len(block), header=header)

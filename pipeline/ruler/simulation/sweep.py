@@ -119,7 +119,7 @@ def sweep(seed: int) -> Scene:
             additions, defect = random_superstructures(shape, size, random), Defect.SUPERSTRUCTURE
         planned.append(_planned(shape, dataclasses.replace(size, additions=size.additions + additions), random))
         defects.append((defect,) if additions else ())
-    rows = [_row(random) for _ in range(ROWS)]
+    rows = [random_row(random) for _ in range(ROWS)]
     planned += [row.as_one for row in rows]
     order = random.permutation(len(planned))
     plots, extent = packed_plots([planned[k] for k in order], _STRIP_M, 2)
@@ -152,7 +152,7 @@ def _planned(shape: RoofShape, size: RoofDimensions, random: np.random.Generator
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class _Row:
+class Row:
     """Houses wall to wall, each with its own eave."""
 
     widths_m: tuple[float, ...]
@@ -189,9 +189,10 @@ class _Row:
         return built
 
 
-def _row(random: np.random.Generator) -> _Row:
+def random_row(random: np.random.Generator) -> Row:
+    """Four to six houses."""
     count = int(random.integers(4, 7))
-    return _Row(
+    return Row(
         widths_m=tuple(float(width) for width in random.uniform(5.5, 8.5, count)),
         eaves_m=tuple(5.6 + float(step) for step in random.uniform(0.0, 1.6, count)),
         depth_m=float(random.uniform(9.0, 12.0)),
