@@ -89,8 +89,7 @@ def _planes_and_lines(
         return refitted_planes(points, np.zeros(len(points), np.int32), planes, cap_m), lines
     labels, raster = raster_labels(points, planes, edges, limits.cell_m, cap_m, limits.cost_per_m)
     planes = refitted_planes(points, labels_of_points(points, labels, raster), planes, cap_m)
-    places, pairs = border_places(labels, raster, k)
-    lines = candidate_lines(places, pairs, points, planes, edges, raster.cell_m, cap_m, limits.line_length_m)
+    lines = candidate_lines(border_places(labels, raster, k), points, planes, edges, raster.cell_m, limits)
     return planes, with_guides(lines, guides, raster.cell_m, limits.line_length_m)
 
 

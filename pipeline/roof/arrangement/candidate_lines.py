@@ -14,9 +14,11 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.compiler import kernel
-from pipeline.kernels.sorting import ascending_order, in_order
+from pipeline.kernels.sorting import ascending_order
 from pipeline.model import FloatArray, IntArray, LabelArray
-from pipeline.roof.arrangement.raster_labels import Raster, vertical_distance_m
+from pipeline.roof.arrangement.raster_labels import Limits, Raster, vertical_distance_m
+from pipeline.roof.outlines.description import least_description
+from pipeline.roof.outlines.exterior import PRICES
 
 _MIN_SLOPE = 0.08
 """Difference of slopes below which two planes cross nowhere exactly: their noise moves the line by metres."""
@@ -26,8 +28,10 @@ _MAX_CROSSING_CELLS = 4.0
 """Farthest such place where planes differ so little that the points do not show their side; others are steps."""
 _NOISE_M = 0.1
 """Added to distances in cells: where cells are small, the noise of the points decides where a border lies."""
-_BAND_CELLS = 1.1
-"""Width of the band in which the places of one step lie, by the resolution of the labels."""
+_NOISE_SPACINGS, _NOISE_CELLS = 0.3, 0.6
+"""Standard deviation of places about their step, in point spacings and cells, the larger one."""
+_FAR = 1e8
+"""Added to squared distances, m2."""
 _SHIFT_CELLS = 0.6
 """How far a step may move from the middle of its band: little more than half its width."""
 _CROSSING_BONUS = 1.5
@@ -46,6 +50,19 @@ _DIRECTIONS_OF_PLANES = 4
 """Room for the fall lines and contours of two planes."""
 _ROUNDING = 1e-9
 """Costs and distances (metres) closer than this are equal: their last bits depend on the order of sums."""
+
+
+class Border(NamedTuple):
+    """The borders between cells of different labels: each a place amid two neighbours, by their pair of labels."""
+
+    places: FloatArray
+    """(m, 2) float64, metres."""
+    pairs: IntArray
+    """(m,) int64, low * planes + high, ascending."""
+    ends: IntArray
+    """(m, 2) int64, the two corners of the cells between which the border lies there, ascending."""
+    corners: int
+    """How many corners there are."""
 
 
 class CandidateLines(NamedTuple):
@@ -104,13 +121,10 @@ def _with_directions_of(plane: FloatArray, directions: FloatArray, n: int) -> in
 
 
 @kernel
-def border_places(labels: LabelArray, raster: Raster, n_planes: int) -> tuple[FloatArray, IntArray]:
-    """Places (m, 2) in metres amid neighbouring cells of different labels, ordered by their pair of labels.
-
-    Also returns those pairs, (m,) int64: low * n_planes + high, ascending.
-    """
+def border_places(labels: LabelArray, raster: Raster, n_planes: int) -> Border:
+    """The borders between neighbouring cells of different labels, (n,)."""
     place, columns = raster.place, raster.columns
-    places = np.empty((2 * len(place), 2))
+    places, ends = np.empty((2 * len(place), 2)), np.empty((2 * len(place), 2), np.int64)
     pairs = np.empty(2 * len(place), np.int64)
     m = 0
     for i in range(len(place)):
@@ -123,40 +137,82 @@ def border_places(labels: LabelArray, raster: Raster, n_planes: int) -> tuple[Fl
                 continue
             places[m, 0] = raster.west + (c + 0.5 + 0.5 * (step == 0)) * raster.cell_m
             places[m, 1] = raster.south + (r + 0.5 + 0.5 * (step == 1)) * raster.cell_m
+            # a column and a row of corners more than of cells
+            ends[m, 1] = (r + 1) * (columns + 1) + c + 1
+            ends[m, 0] = ends[m, 1] - (columns + 1 if step == 0 else 1)
             pairs[m] = np.int64(min(labels[i], labels[j])) * n_planes + max(labels[i], labels[j])
             m += 1
     order = ascending_order(pairs[:m])
-    ordered, ordered_pairs = np.empty((m, 2)), np.empty(m, np.int64)
-    for s in range(m):
-        ordered[s, 0], ordered[s, 1] = places[order[s], 0], places[order[s], 1]
-        ordered_pairs[s] = pairs[order[s]]
-    return ordered, ordered_pairs
+    return Border(places[order], pairs[order], ends[order], (columns + 1) * (raster.rows + 1))
 
 
 @kernel
-def _best_band(
-    places: FloatArray, first: int, last: int, line_of: LabelArray, directions: FloatArray, n: int, band_m: float
-) -> tuple[int, float, float]:
-    """How many places, the direction and offset of the band that holds most of first..last without a line yet."""
-    most, best_angle, best_offset = 0, 0.0, 0.0
-    offsets = np.empty(last - first)
-    for d in range(n):
-        across_x, across_y = -math.sin(directions[d]), math.cos(directions[d])
-        m = 0
-        for q in range(first, last):
-            if line_of[q] < 0:
-                offsets[m] = across_x * places[q, 0] + across_y * places[q, 1]
-                m += 1
-        ordered = in_order(offsets[:m])
-        end = 0
-        for begin in range(m):
-            while end < m and ordered[end] <= ordered[begin] + band_m:
-                end += 1
-            if end - begin > most:
-                most = end - begin
-                best_angle = directions[d]
-                best_offset = 0.5 * (ordered[begin] + ordered[end - 1])
-    return most, best_angle, best_offset
+def _chains(border: Border, members: IntArray, at: IntArray) -> tuple[IntArray, IntArray]:
+    """The places `members` in chains along the border: they in their order, and the first of each chain, (c + 1,).
+
+    A chain ends where the border ends or forks; a closed one begins at its place farthest from the middle of them. `at`
+    (corners, 3) is work space, zero before and after.
+    """
+    m = len(members)
+    order, starts = np.empty(m, np.int64), np.zeros(m + 1, np.int64)
+    left = np.zeros(m, np.bool_)
+    x, y = 0.0, 0.0
+    for s in range(m):
+        left[s] = True
+        x, y = x + border.places[members[s], 0] / m, y + border.places[members[s], 1] / m
+        for side in range(2):
+            corner = border.ends[members[s], side]
+            at[corner, min(at[corner, 2], 1)] = s
+            at[corner, 2] += 1
+    n, chains = 0, 0
+    away = np.empty(m)
+    for s in range(m):
+        # chains with an end come first, from there
+        is_inner = at[border.ends[members[s], 0], 2] == 2 and at[border.ends[members[s], 1], 2] == 2
+        away[s] = -(border.places[members[s], 0] - x) ** 2 - (border.places[members[s], 1] - y) ** 2
+        if not is_inner:
+            away[s] -= _FAR
+    for s in ascending_order(np.rint(away * 1e6)):
+        if not left[s]:
+            continue
+        corner = border.ends[members[s], 1]
+        if at[corner, 2] != 2:
+            corner = border.ends[members[s], 0]
+        here = s
+        while left[here]:
+            left[here] = False
+            order[n] = members[here]
+            n += 1
+            if at[corner, 2] != 2:
+                break
+            here = at[corner, 0] + at[corner, 1] - here
+            corner = border.ends[members[here], 0] + border.ends[members[here], 1] - corner
+        chains += 1
+        starts[chains] = n
+    for s in range(m):
+        for side in range(2):
+            at[border.ends[members[s], side]] = 0
+    return order, starts[: chains + 1].copy()
+
+
+@kernel
+def _meet(one: IntArray, other: IntArray) -> bool:
+    """Whether the borders at two places have an end in common."""
+    return bool(one[0] == other[0] or one[0] == other[1] or one[1] == other[0] or one[1] == other[1])
+
+
+@kernel
+def _steps(chain: FloatArray, is_closed: bool, directions: FloatArray, spacing_m: float, cell_m: float) -> FloatArray:
+    """The edges of the shortest description of a chain of places (m, 2): first and last place, direction, (e, 3)."""
+    m = len(chain)
+    breaks = np.arange(m + 1 if is_closed else m)
+    noise_mm = 1e3 * max(_NOISE_SPACINGS * spacing_m, _NOISE_CELLS * cell_m)
+    per_mm = 0.5 / (1e3 * spacing_m * noise_mm * noise_mm)
+    ends, _, angles, _ = least_description(chain * 1e3, breaks, directions, per_mm, PRICES)
+    edges = np.empty((len(angles), 3))
+    for e in range(len(angles)):
+        edges[e, 0], edges[e, 1], edges[e, 2] = ends[e], ends[e + 1], angles[e]
+    return edges
 
 
 @kernel
@@ -228,31 +284,18 @@ def _take_places(
 
 @kernel
 def candidate_lines(
-    places: FloatArray,
-    pairs: IntArray,
-    points: FloatArray,
-    planes: FloatArray,
-    edges: FloatArray,
-    cell_m: float,
-    cap_m: float,
-    min_length_m: float,
+    border: Border, points: FloatArray, planes: FloatArray, edges: FloatArray, cell_m: float, limits: Limits
 ) -> CandidateLines:
     """Lines along the `border_places` of coarse labels of planes (k, 3) through roof points (n, 3).
 
-    Parameters
-    ----------
-    edges : (e, 4) float64
-        Edges of the outline, metres.
-    cell_m : float
-        Cell of the labels.
-    cap_m : float
-        Residual from which a point is unexplained.
-    min_length_m : float
-        Shorter borders give no line.
+    `edges` (e, 4) are those of the outline in metres, `cell_m` is the cell of the labels.
     """
+    places, pairs = border.places, border.pairs
     k = len(planes)
     m = len(places)
-    least = max(2, math.ceil(min_length_m / cell_m))
+    cap_m, spacing_m = limits.cap_m, 1.0 / math.sqrt(limits.points_per_m2)
+    least = max(2, math.ceil(limits.line_length_m / cell_m))
+    at = np.zeros((border.corners, 3), np.int64)
     lines = np.empty((m + 1, 3))
     scores = np.empty(m + 1)
     crossing = np.zeros(m + 1, np.int32)
@@ -267,7 +310,6 @@ def candidate_lines(
         while last < m and pairs[last] == pairs[first]:
             last += 1
         one, other = pairs[first] // k, pairs[first] % k
-        free = last - first
         for axis in range(3):
             difference[axis] = planes[one, axis] - planes[other, axis]
         turn = math.hypot(difference[0], difference[1])
@@ -280,7 +322,6 @@ def candidate_lines(
                     lines[n_lines, axis] = difference[axis] / turn
                 scores[n_lines] = _CROSSING_BONUS * on_line
                 crossing[n_lines] = 1
-                free -= on_line
                 n_lines += 1
             else:
                 line_of[first:last] = -1
@@ -289,31 +330,37 @@ def candidate_lines(
             directions[q] = outline[q]
         n = _with_directions_of(planes[one], directions, n)
         n = _with_directions_of(planes[other], directions, n)
-        while free >= least:
-            most, angle, offset = _best_band(places, first, last, line_of, directions, n, _BAND_CELLS * cell_m)
-            if most < least:
-                break
-            line = lines[n_lines]
-            line[0], line[1], line[2] = -math.sin(angle), math.cos(angle), -offset
-            low, high = math.inf, -math.inf
-            for q in range(first, last):
-                off = line[0] * places[q, 0] + line[1] * places[q, 1] + line[2]
-                if line_of[q] < 0 and abs(off) <= 0.5 * _BAND_CELLS * cell_m + _ROUNDING:
+        members = first + np.flatnonzero(line_of[first:last] < 0)
+        order, starts = _chains(border, members, at)
+        for c in range(len(starts) - 1):
+            chain = order[starts[c] : starts[c + 1]]
+            if len(chain) < least:
+                continue
+            is_closed = len(chain) > 3 and _meet(border.ends[chain[0]], border.ends[chain[-1]])
+            for begin, end, angle in _steps(places[chain], is_closed, directions[:n], spacing_m, cell_m):
+                across_x, across_y = -math.sin(angle), math.cos(angle)
+                along_x, along_y = -across_y, across_x
+                taken, offset, low, high = 0, 0.0, math.inf, -math.inf
+                for s in range(int(begin), int(end) + 1):
+                    q = chain[s % len(chain)]
                     line_of[q] = n_lines
-                    free -= 1
-                    along = -line[1] * places[q, 0] + line[0] * places[q, 1]
+                    taken += 1
+                    offset += across_x * places[q, 0] + across_y * places[q, 1]
+                    along = along_x * places[q, 0] + along_y * places[q, 1]
                     low, high = min(low, along), max(high, along)
-            reach_m = _SHIFT_CELLS * cell_m + _NOISE_M
-            half = 0.5 * cell_m
-            shift = _parting_shift(points, planes, (one, other), line, low - half, high + half, cap_m, reach_m)
-            if not math.isnan(shift):
-                line[2] -= shift
-            elif turn > _MIN_SLOPE:
-                # a border in a gap of the points lies anywhere: it is where the planes themselves meet
-                for axis in range(3):
-                    line[axis] = difference[axis] / turn
-                crossing[n_lines] = 1
-            scores[n_lines] = most
-            n_lines += 1
+                line = lines[n_lines]
+                line[0], line[1], line[2] = across_x, across_y, -offset / taken
+                reach_m = _SHIFT_CELLS * cell_m + _NOISE_M
+                half = 0.5 * cell_m
+                shift = _parting_shift(points, planes, (one, other), line, low - half, high + half, cap_m, reach_m)
+                if not math.isnan(shift):
+                    line[2] -= shift
+                elif turn > _MIN_SLOPE:
+                    # a border in a gap of the points lies anywhere: it is where the planes themselves meet
+                    for axis in range(3):
+                        line[axis] = difference[axis] / turn
+                    crossing[n_lines] = 1
+                scores[n_lines] = taken
+                n_lines += 1
         first = last
     return CandidateLines(lines[:n_lines].copy(), scores[:n_lines].copy(), crossing[:n_lines].copy(), places, line_of)
