@@ -13,7 +13,7 @@ from pipeline.compiler import kernel
 from pipeline.errors import BuildingError
 from pipeline.model import FloatArray, IntArray, LabelArray, Plane, Reason
 from pipeline.roof.arrangement.arranged_faces import corners_of_borders, part_crossings, rings_of_faces, trace_faces
-from pipeline.roof.arrangement.candidate_lines import CandidateLines, border_places, candidate_lines
+from pipeline.roof.arrangement.candidate_lines import CandidateLines, border_places, candidate_lines, outline_directions
 from pipeline.roof.arrangement.far_corners import (
     HeightsAround,
     add_costs_of_far_planes,
@@ -192,7 +192,8 @@ def _arranged(
     if n_faces > 1 and limits.clearance == 1.0:
         edges = edges_of_rings(xy, vertices, ring_starts, owner)
         mark_edges_on_guides(xy, edges, guides.pieces)
-        borders = Borders(xy, edges, plane_of_face, np.arange(len(xy)) < len(outline.xy))
+        directions = outline_directions(_outline_edges(outline))
+        borders = Borders(xy, edges, plane_of_face, np.arange(len(xy)) < len(outline.xy), directions)
         rings = vertices, ring_starts
         vertices, ring_starts, planes = clean_borders(borders, rings, points, label_of_point, planes, limits)
     support = support_of_planes(points, label_of_point, planes, limits.cap_m)

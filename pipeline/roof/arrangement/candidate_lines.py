@@ -81,7 +81,7 @@ class CandidateLines(NamedTuple):
 
 
 @kernel
-def _outline_directions(edges: FloatArray) -> FloatArray:
+def outline_directions(edges: FloatArray) -> FloatArray:
     """Directions of the long edges (e, 4) of an outline and those square to them, longest first, in [0, pi), (n,)."""
     shortness = np.empty(len(edges))
     for e in range(len(edges)):
@@ -300,7 +300,7 @@ def candidate_lines(
     scores = np.empty(m + 1)
     crossing = np.zeros(m + 1, np.int32)
     line_of = np.full(m, -1, np.int32)
-    outline = _outline_directions(edges)
+    outline = outline_directions(edges)
     directions = np.empty(len(outline) + _DIRECTIONS_OF_PLANES)
     difference = np.empty(3)
     n_lines = 0

@@ -40,6 +40,8 @@ class Borders(NamedTuple):
     """(f,) int32."""
     is_fixed: BoolArray
     """(v,), the vertices of the outline."""
+    directions: FloatArray = np.empty(0)
+    """(d,) float64, those of the outline, which steps keep, radians."""
 
 
 class Ends(NamedTuple):
