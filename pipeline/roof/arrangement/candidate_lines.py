@@ -28,7 +28,7 @@ _MAX_CROSSING_CELLS = 4.0
 """Farthest such place where planes differ so little that the points do not show their side; others are steps."""
 _NOISE_M = 0.1
 """Added to distances in cells: where cells are small, the noise of the points decides where a border lies."""
-_NOISE_SPACINGS, _NOISE_CELLS = 0.3, 0.6
+_NOISE_SPACINGS, _NOISE_M2 = 0.3, 0.2
 """Standard deviation of places about their step, in point spacings and cells, the larger one."""
 _FAR = 1e8
 """Added to squared distances, m2."""
@@ -206,7 +206,7 @@ def _steps(chain: FloatArray, is_closed: bool, directions: FloatArray, spacing_m
     """The edges of the shortest description of a chain of places (m, 2): first and last place, direction, (e, 3)."""
     m = len(chain)
     breaks = np.arange(m + 1 if is_closed else m)
-    noise_mm = 1e3 * max(_NOISE_SPACINGS * spacing_m, _NOISE_CELLS * cell_m)
+    noise_mm = 1e3 * max(_NOISE_SPACINGS * spacing_m, _NOISE_M2)
     per_mm = 0.5 / (1e3 * spacing_m * noise_mm * noise_mm)
     ends, _, angles, _ = least_description(chain * 1e3, breaks, directions, per_mm, PRICES)
     edges = np.empty((len(angles), 3))
