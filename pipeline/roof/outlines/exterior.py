@@ -134,7 +134,7 @@ def described(rings: Sequence[_Ring], spacing_mm: float, noise_mm: float) -> lis
     rings = [_begun_at_a_corner(ring, own) for ring, own in zip(rings, runs, strict=True)]
     found = [_runs(ring, none, per_mm, alone) for ring in rings]
     least, best = math.fsum(cost for _, cost in found), [own for own, _ in found]
-    tried = _peaks([run for own in best for run in own])
+    tried = peaks_of([run for own in best for run in own])
     systems: list[float] = []
     while len(systems) < _SYSTEMS:
         better: tuple[float, list[float], list[list[Run]]] | None = None
@@ -143,7 +143,7 @@ def described(rings: Sequence[_Ring], spacing_mm: float, noise_mm: float) -> lis
                 continue
             more = [*systems, angle]
             for _ in range(2):
-                found = [_runs(ring, _pairs(more), per_mm, PRICES) for ring in rings]
+                found = [_runs(ring, pairs_of(more), per_mm, PRICES) for ring in rings]
                 cost = math.fsum(own_cost for _, own_cost in found) + _SYSTEM * len(more)
                 if better is None or cost < better[0]:
                     better = cost, more, [own for own, _ in found]
@@ -165,7 +165,18 @@ def _runs(ring: _Ring, directions: FloatArray, per_mm: float, prices: Prices) ->
     return runs, cost
 
 
-def _pairs(systems: Sequence[float]) -> FloatArray:
+def described_chain(
+    border: FloatArray, directions: FloatArray, spacing_mm: float, noise_mm: float, prices: Prices
+) -> list[Run]:
+    """The edges of an open border (n, 2), of which `directions` are common to others."""
+    step = _BREAK_SPACINGS * spacing_mm
+    breaks = breaks_of(border, step)[:-1]
+    breaks = np.append(breaks[:-1] if len(breaks) > 1 else breaks, len(border) - 1)
+    per_mm = 0.5 / (spacing_mm * noise_mm * noise_mm)
+    return _runs(_Ring(border=border, breaks=breaks), directions, per_mm, prices)[0]
+
+
+def pairs_of(systems: Sequence[float]) -> FloatArray:
     """Every direction, and the one square to it."""
     return np.array([angle + turn for angle in systems for turn in (0.0, _QUARTER)])
 
@@ -175,7 +186,7 @@ def off_square(direction: float, dominant: float) -> float:
     return math.remainder(direction - dominant, _QUARTER)
 
 
-def _peaks(runs: Sequence[Run]) -> list[float]:
+def peaks_of(runs: Sequence[Run]) -> list[float]:
     """Directions, modulo a right angle, that most of the squared length of some edges has, the first with most."""
     left = [(run.direction, run.length**2) for run in runs]
     whole = math.fsum(weight for _, weight in left)
@@ -218,11 +229,11 @@ def _more_exact(systems: Sequence[float], drawn: Sequence[tuple[_Ring, list[Run]
 
 def _with_breaks(border: FloatArray, step_mm: float) -> _Ring:
     """A ring with breaks at vertices that lie a step or more apart."""
-    return _Ring(border=border, breaks=_breaks(border, step_mm))
+    return _Ring(border=border, breaks=breaks_of(border, step_mm))
 
 
 @kernel
-def _breaks(border: FloatArray, step: float) -> IntArray:
+def breaks_of(border: FloatArray, step: float) -> IntArray:
     """Numbers of vertices of a ring (n, 2), ascending from 0 to n, each a step or more from the one before."""
     n = len(border)
     breaks = np.empty(n + 1, np.int64)
