@@ -33,6 +33,8 @@ _ONE_WAY = 0.1
 """Sine of the angle below which edges have one direction."""
 _TURN = 2.0
 """Corners that a step along the outline must save to lose its direction: as many as one end of it is."""
+_OWN = 0.5
+"""A step's own direction is that of an edge at least this part as long."""
 _ASIDE_MM = 60.0
 """A step has a direction if its ends lie this near to a line along it: chords pass through vertices this near."""
 _ASIDE = 0.05
@@ -135,12 +137,19 @@ def _is_along(borders: Borders, v: int, w: int) -> bool:
 
 @kernel(inline="always")
 def _turned_steps(borders: Borders, planes: FloatArray, u: int, v: int, found: IntArray, gap_m: float) -> int:
-    """How many of the found edges at u are steps that run along a direction now and not from v."""
+    """How many of the found edges at u are steps that get a direction of their own if they start from v.
+
+    A much shorter one that has its own direction now is as if it were along the others: noise turns it.
+    """
+    xy = borders.xy
     turned = 0
     for e in found:
         w = borders.edges[e, 0] + borders.edges[e, 1] - u
         if w != v and _is_step(borders, planes, e, gap_m):
-            turned += _is_along(borders, u, w) and not _is_along(borders, v, w)
+            before = math.hypot(float(xy[w, 0] - xy[u, 0]), float(xy[w, 1] - xy[u, 1]))
+            after = math.hypot(float(xy[w, 0] - xy[v, 0]), float(xy[w, 1] - xy[v, 1]))
+            is_own = before >= _OWN * after and not _is_along(borders, u, w)
+            turned += not is_own and not _is_along(borders, v, w)
     return turned
 
 
