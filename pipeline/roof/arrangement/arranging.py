@@ -13,7 +13,7 @@ from pipeline.compiler import kernel
 from pipeline.errors import BuildingError
 from pipeline.model import FloatArray, IntArray, LabelArray, Plane, Reason
 from pipeline.roof.arrangement.arranged_faces import corners_of_borders, part_crossings, rings_of_faces, trace_faces
-from pipeline.roof.arrangement.candidate_lines import CandidateLines, border_places, candidate_lines, outline_directions
+from pipeline.roof.arrangement.candidate_lines import CandidateLines, candidate_lines, outline_directions
 from pipeline.roof.arrangement.far_corners import (
     HeightsAround,
     add_costs_of_far_planes,
@@ -31,6 +31,7 @@ from pipeline.roof.arrangement.moved_vertices import move_vertices
 from pipeline.roof.arrangement.plan_cells import cell_borders, cell_costs, cells_of_points, points_per_cell, unite_faces
 from pipeline.roof.arrangement.plane_refit import labels_of_points, refitted_planes, support_of_planes
 from pipeline.roof.arrangement.raster_labels import Limits, limits_at, raster_labels
+from pipeline.roof.arrangement.step_lines import border_places
 from pipeline.roof.arrangement.subdivision import CELLS, EDGES, VERTICES, Subdivision, subdivide, subdivision_of
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.roof_settings import ArrangementSettings

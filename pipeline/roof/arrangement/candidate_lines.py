@@ -1,9 +1,9 @@
 """Candidate lines from the borders of coarse labels: where planes cross, else steps along the building's directions.
 
 A border between two labels is a set of places, each half-way between two neighbouring cells. Places near the line in
-which the two planes cross are a ridge, hip or valley and support that line exactly. The others are cut into steps:
-lines along the outline, a contour or a fall line of one of the planes, as long as they find enough places. Each line
-then moves to where it separates the points of the two planes at the least cost.
+which the two planes cross are a ridge, hip or valley and support that line exactly. The others are steps
+(`step_lines`): along the outline, a contour or a fall line of one of the planes where that describes them well. Each
+line then moves to where it separates the points of the two planes at the least cost.
 """
 
 from __future__ import annotations
@@ -16,9 +16,8 @@ import numpy as np
 from pipeline.compiler import kernel
 from pipeline.kernels.sorting import ascending_order
 from pipeline.model import FloatArray, IntArray, LabelArray
-from pipeline.roof.arrangement.raster_labels import Limits, Raster, vertical_distance_m
-from pipeline.roof.outlines.description import least_description
-from pipeline.roof.outlines.exterior import PRICES
+from pipeline.roof.arrangement.raster_labels import Limits, vertical_distance_m
+from pipeline.roof.arrangement.step_lines import Border, chains_of, steps_of
 
 _MIN_SLOPE = 0.08
 """Difference of slopes below which two planes cross nowhere exactly: their noise moves the line by metres."""
@@ -28,12 +27,8 @@ _MAX_CROSSING_CELLS = 4.0
 """Farthest such place where planes differ so little that the points do not show their side; others are steps."""
 _NOISE_M = 0.1
 """Added to distances in cells: where cells are small, the noise of the points decides where a border lies."""
-_NOISE_SPACINGS, _NOISE_M2 = 0.3, 0.2
-"""Standard deviation of places about their step, in point spacings and cells, the larger one."""
-_FAR = 1e8
-"""Added to squared distances, m2."""
 _SHIFT_CELLS = 0.6
-"""How far a step may move from the middle of its band: little more than half its width."""
+"""How far a step may move from the middle of its places."""
 _CROSSING_BONUS = 1.5
 """A crossing comes before a step with as many places, since its position is exact. Decides only an order."""
 _MIN_EDGE_M = 1.0
@@ -50,19 +45,6 @@ _DIRECTIONS_OF_PLANES = 4
 """Room for the fall lines and contours of two planes."""
 _ROUNDING = 1e-9
 """Costs and distances (metres) closer than this are equal: their last bits depend on the order of sums."""
-
-
-class Border(NamedTuple):
-    """The borders between cells of different labels: each a place amid two neighbours, by their pair of labels."""
-
-    places: FloatArray
-    """(m, 2) float64, metres."""
-    pairs: IntArray
-    """(m,) int64, low * planes + high, ascending."""
-    ends: IntArray
-    """(m, 2) int64, the two corners of the cells between which the border lies there, ascending."""
-    corners: int
-    """How many corners there are."""
 
 
 class CandidateLines(NamedTuple):
@@ -118,101 +100,6 @@ def _with_directions_of(plane: FloatArray, directions: FloatArray, n: int) -> in
         n = _with_direction(directions, n, fall % math.pi)
         n = _with_direction(directions, n, (fall + math.pi / 2) % math.pi)
     return n
-
-
-@kernel
-def border_places(labels: LabelArray, raster: Raster, n_planes: int) -> Border:
-    """The borders between neighbouring cells of different labels, (n,)."""
-    place, columns = raster.place, raster.columns
-    places, ends = np.empty((2 * len(place), 2)), np.empty((2 * len(place), 2), np.int64)
-    pairs = np.empty(2 * len(place), np.int64)
-    m = 0
-    for i in range(len(place)):
-        r, c = place[i] // columns, place[i] % columns
-        for step in range(2):
-            if (c + 1 >= columns) if step == 0 else (r + 1 >= raster.rows):
-                continue
-            j = raster.number[place[i] + (1 if step == 0 else columns)]
-            if j < 0 or labels[j] == labels[i]:
-                continue
-            places[m, 0] = raster.west + (c + 0.5 + 0.5 * (step == 0)) * raster.cell_m
-            places[m, 1] = raster.south + (r + 0.5 + 0.5 * (step == 1)) * raster.cell_m
-            # a column and a row of corners more than of cells
-            ends[m, 1] = (r + 1) * (columns + 1) + c + 1
-            ends[m, 0] = ends[m, 1] - (columns + 1 if step == 0 else 1)
-            pairs[m] = np.int64(min(labels[i], labels[j])) * n_planes + max(labels[i], labels[j])
-            m += 1
-    order = ascending_order(pairs[:m])
-    return Border(places[order], pairs[order], ends[order], (columns + 1) * (raster.rows + 1))
-
-
-@kernel
-def _chains(border: Border, members: IntArray, at: IntArray) -> tuple[IntArray, IntArray]:
-    """The places `members` in chains along the border: they in their order, and the first of each chain, (c + 1,).
-
-    A chain ends where the border ends or forks; a closed one begins at its place farthest from the middle of them. `at`
-    (corners, 3) is work space, zero before and after.
-    """
-    m = len(members)
-    order, starts = np.empty(m, np.int64), np.zeros(m + 1, np.int64)
-    left = np.zeros(m, np.bool_)
-    x, y = 0.0, 0.0
-    for s in range(m):
-        left[s] = True
-        x, y = x + border.places[members[s], 0] / m, y + border.places[members[s], 1] / m
-        for side in range(2):
-            corner = border.ends[members[s], side]
-            at[corner, min(at[corner, 2], 1)] = s
-            at[corner, 2] += 1
-    n, chains = 0, 0
-    away = np.empty(m)
-    for s in range(m):
-        # chains with an end come first, from there
-        is_inner = at[border.ends[members[s], 0], 2] == 2 and at[border.ends[members[s], 1], 2] == 2
-        away[s] = -(border.places[members[s], 0] - x) ** 2 - (border.places[members[s], 1] - y) ** 2
-        if not is_inner:
-            away[s] -= _FAR
-    for s in ascending_order(np.rint(away * 1e6)):
-        if not left[s]:
-            continue
-        corner = border.ends[members[s], 1]
-        if at[corner, 2] != 2:
-            corner = border.ends[members[s], 0]
-        here = s
-        while left[here]:
-            left[here] = False
-            order[n] = members[here]
-            n += 1
-            if at[corner, 2] != 2:
-                break
-            here = at[corner, 0] + at[corner, 1] - here
-            corner = border.ends[members[here], 0] + border.ends[members[here], 1] - corner
-        chains += 1
-        starts[chains] = n
-    for s in range(m):
-        for side in range(2):
-            at[border.ends[members[s], side]] = 0
-    return order, starts[: chains + 1].copy()
-
-
-@kernel
-def _meet(one: IntArray, other: IntArray) -> bool:
-    """Whether the borders at two places have an end in common."""
-    return bool(one[0] == other[0] or one[0] == other[1] or one[1] == other[0] or one[1] == other[1])
-
-
-@kernel
-def _steps(chain: FloatArray, is_closed: bool, directions: FloatArray, spacing_m: float, cell_m: float) -> FloatArray:
-    """The edges of the shortest description of a chain of places (m, 2): first and last place, direction, (e, 3)."""
-    m = len(chain)
-    breaks = np.arange(m + 1 if is_closed else m)
-    noise_mm = 1e3 * max(_NOISE_SPACINGS * spacing_m, _NOISE_M2)
-    per_mm = 0.5 / (1e3 * spacing_m * noise_mm * noise_mm)
-    ends, _, angles, _ = least_description(chain * 1e3, breaks, directions, per_mm, PRICES)
-    edges = np.empty((len(angles), 3))
-    for e in range(len(angles)):
-        edges[e, 0], edges[e, 1], edges[e, 2] = ends[e], ends[e + 1], angles[e]
-    return edges
 
 
 @kernel
@@ -282,6 +169,29 @@ def _take_places(
     return taken
 
 
+@kernel(inline="always")
+def _take_step(
+    places: FloatArray,
+    chain: IntArray,
+    begin: int,
+    end: int,
+    angle: float,
+    line: FloatArray,
+    line_of: LabelArray,
+    number: int,
+) -> tuple[float, float]:
+    """Give places of a chain the number of their step, and draw its line amid them; its begin and end along it."""
+    line[0], line[1], line[2] = -math.sin(angle), math.cos(angle), 0.0
+    low, high = math.inf, -math.inf
+    for s in range(begin, end + 1):
+        q = chain[s % len(chain)]
+        line_of[q] = number
+        line[2] -= (line[0] * places[q, 0] + line[1] * places[q, 1]) / (end + 1 - begin)
+        along = -line[1] * places[q, 0] + line[0] * places[q, 1]
+        low, high = min(low, along), max(high, along)
+    return low, high
+
+
 @kernel
 def candidate_lines(
     border: Border, points: FloatArray, planes: FloatArray, edges: FloatArray, cell_m: float, limits: Limits
@@ -330,26 +240,15 @@ def candidate_lines(
             directions[q] = outline[q]
         n = _with_directions_of(planes[one], directions, n)
         n = _with_directions_of(planes[other], directions, n)
-        members = first + np.flatnonzero(line_of[first:last] < 0)
-        order, starts = _chains(border, members, at)
+        order, starts = chains_of(border, first + np.flatnonzero(line_of[first:last] < 0), at)
         for c in range(len(starts) - 1):
             chain = order[starts[c] : starts[c + 1]]
             if len(chain) < least:
                 continue
-            is_closed = len(chain) > 3 and _meet(border.ends[chain[0]], border.ends[chain[-1]])
-            for begin, end, angle in _steps(places[chain], is_closed, directions[:n], spacing_m, cell_m):
-                across_x, across_y = -math.sin(angle), math.cos(angle)
-                along_x, along_y = -across_y, across_x
-                taken, offset, low, high = 0, 0.0, math.inf, -math.inf
-                for s in range(int(begin), int(end) + 1):
-                    q = chain[s % len(chain)]
-                    line_of[q] = n_lines
-                    taken += 1
-                    offset += across_x * places[q, 0] + across_y * places[q, 1]
-                    along = along_x * places[q, 0] + along_y * places[q, 1]
-                    low, high = min(low, along), max(high, along)
+            ends, angles = steps_of(border, chain, directions[:n], spacing_m)
+            for e in range(len(angles)):
                 line = lines[n_lines]
-                line[0], line[1], line[2] = across_x, across_y, -offset / taken
+                low, high = _take_step(places, chain, ends[e], ends[e + 1], angles[e], line, line_of, n_lines)
                 reach_m = _SHIFT_CELLS * cell_m + _NOISE_M
                 half = 0.5 * cell_m
                 shift = _parting_shift(points, planes, (one, other), line, low - half, high + half, cap_m, reach_m)
@@ -360,7 +259,7 @@ def candidate_lines(
                     for axis in range(3):
                         line[axis] = difference[axis] / turn
                     crossing[n_lines] = 1
-                scores[n_lines] = taken
+                scores[n_lines] = ends[e + 1] - ends[e] + 1
                 n_lines += 1
         first = last
     return CandidateLines(lines[:n_lines].copy(), scores[:n_lines].copy(), crossing[:n_lines].copy(), places, line_of)

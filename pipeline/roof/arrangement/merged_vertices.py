@@ -15,12 +15,14 @@ import numpy as np
 from pipeline.compiler import kernel
 from pipeline.kernels.sorting import ascending_order
 from pipeline.model import FloatArray, IntArray
+from pipeline.roof.arrangement.kept_directions import TURN, cost_of_sliding, slid_end, turned_steps
 from pipeline.roof.arrangement.movable_borders import (
     KEEPS,
     MAX_DEGREE,
     Borders,
     Buckets,
     Ends,
+    are_parallel,
     buckets_of,
     cost_of_moving,
     edges_at,
@@ -29,18 +31,6 @@ from pipeline.roof.arrangement.movable_borders import (
 )
 from pipeline.roof.arrangement.raster_labels import Limits
 
-_ONE_WAY = 0.1
-"""Sine of the angle below which edges have one direction."""
-_TURN = 2.0
-"""Corners that a step along the outline must save to lose its direction: as many as one end of it is."""
-_OWN = 0.5
-"""A step's own direction is that of an edge at least this part as long."""
-_ASIDE_MM = 60.0
-"""A step has a direction if its ends lie this near to a line along it: chords pass through vertices this near."""
-_ASIDE = 0.05
-"""The same for long steps, as a share of their length; about 3 degrees."""
-_LEAST_TURN = 0.3
-"""Sine of the angle between two edges from which on the place where they cross is known."""
 _ROUNDS = 8
 """Most turns through all edges: bounds the work; it ends as soon as nothing changes."""
 
@@ -90,15 +80,6 @@ def _corners_saved(
 
 
 @kernel(inline="always")
-def _are_parallel(xy: IntArray, edges: IntArray, one: int, other: int) -> bool:
-    """Whether two edges have one direction, but for what rounding to 1 mm and passing through vertices turn them."""
-    ax, ay = xy[edges[one, 1], 0] - xy[edges[one, 0], 0], xy[edges[one, 1], 1] - xy[edges[one, 0], 1]
-    bx, by = xy[edges[other, 1], 0] - xy[edges[other, 0], 0], xy[edges[other, 1], 1] - xy[edges[other, 0], 1]
-    turned = abs(float(ax * by - ay * bx))
-    return turned <= _ONE_WAY * math.hypot(float(ax), float(ay)) * math.hypot(float(bx), float(by))
-
-
-@kernel(inline="always")
 def _may_move(borders: Borders, edge: int, found: IntArray, m: int, reach_m: float) -> bool:
     """Whether the vertex with the m found edges may move along one of them: on outline or guide, and not too far."""
     xy, edges = borders.xy, borders.edges
@@ -106,104 +87,10 @@ def _may_move(borders: Borders, edge: int, found: IntArray, m: int, reach_m: flo
     on_outline = False
     for s in range(m):
         on_outline = on_outline or edges[found[s], 3] < 0
-        if edges[found[s], KEEPS] != 0 and not _are_parallel(xy, edges, edge, found[s]):
+        if edges[found[s], KEEPS] != 0 and not are_parallel(xy, edges, edge, found[s]):
             return False
     is_far = math.hypot(float(xy[a, 0] - xy[b, 0]), float(xy[a, 1] - xy[b, 1])) > reach_m * 1e3
     return not (is_far and m > 2) and not (on_outline and edges[edge, 3] >= 0)
-
-
-@kernel(inline="always")
-def _is_step(borders: Borders, planes: FloatArray, edge: int, gap_m: float) -> bool:
-    """Whether the planes beside an edge are more than a gap apart amid it."""
-    xy, edges = borders.xy, borders.edges
-    if edges[edge, 3] < 0:
-        return False
-    a, b = edges[edge, 0], edges[edge, 1]
-    one, other = planes[borders.plane_of_face[edges[edge, 2]]], planes[borders.plane_of_face[edges[edge, 3]]]
-    x, y = 0.5e-3 * (xy[a, 0] + xy[b, 0]), 0.5e-3 * (xy[a, 1] + xy[b, 1])
-    return abs((one[0] - other[0]) * x + (one[1] - other[1]) * y + one[2] - other[2]) > gap_m
-
-
-@kernel(inline="always")
-def _is_along(borders: Borders, v: int, w: int) -> bool:
-    """Whether an edge between two vertices runs along one of the directions."""
-    dx, dy = float(borders.xy[w, 0] - borders.xy[v, 0]), float(borders.xy[w, 1] - borders.xy[v, 1])
-    aside = max(_ASIDE_MM, _ASIDE * math.hypot(dx, dy))
-    for angle in borders.directions:
-        if abs(math.cos(angle) * dy - math.sin(angle) * dx) <= aside:
-            return True
-    return False
-
-
-@kernel(inline="always")
-def _turned_steps(borders: Borders, planes: FloatArray, u: int, v: int, found: IntArray, gap_m: float) -> int:
-    """How many of the found edges at u are steps that get a direction of their own if they start from v.
-
-    A much shorter one that has its own direction now is as if it were along the others: noise turns it.
-    """
-    xy = borders.xy
-    turned = 0
-    for e in found:
-        w = borders.edges[e, 0] + borders.edges[e, 1] - u
-        if w != v and _is_step(borders, planes, e, gap_m):
-            before = math.hypot(float(xy[w, 0] - xy[u, 0]), float(xy[w, 1] - xy[u, 1]))
-            after = math.hypot(float(xy[w, 0] - xy[v, 0]), float(xy[w, 1] - xy[v, 1]))
-            is_own = before >= _OWN * after and not _is_along(borders, u, w)
-            turned += not is_own and not _is_along(borders, v, w)
-    return turned
-
-
-@kernel(inline="always")
-def _slid_end(borders: Borders, ends: Ends, planes: FloatArray, edge: int, u: int, v: int, limits: Limits) -> int:
-    """The other end of the one step at u that would turn if u were merged into v; -1 if it cannot slide with it.
-
-    It slides along its other edges; the last row of `borders.xy` becomes its new place.
-    """
-    xy, edges = borders.xy, borders.edges
-    found = np.empty(MAX_DEGREE, np.int64)
-    m = edges_at(edges, ends, u, found)
-    step = -1
-    for s in range(min(m, MAX_DEGREE)):
-        if found[s] != edge and not _are_parallel(xy, edges, edge, found[s]):
-            if step >= 0:
-                return -1
-            step = found[s]
-    if m > MAX_DEGREE or step < 0 or edges[step, KEEPS] != 0 or not _is_step(borders, planes, step, limits.corner_gap_m):
-        return -1
-    w = edges[step, 0] + edges[step, 1] - u
-    m = edges_at(edges, ends, w, found)
-    if borders.is_fixed[w] or m < 2 or m > 3 or w == v or not _is_along(borders, u, w):
-        return -1
-    along = found[0] if found[0] != step else found[1]
-    for s in range(m):
-        if found[s] != step and not _are_parallel(xy, edges, along, found[s]):
-            return -1
-    sx, sy = float(xy[w, 0] - xy[u, 0]), float(xy[w, 1] - xy[u, 1])
-    ax, ay = float(xy[edges[along, 1], 0] - xy[edges[along, 0], 0]), float(xy[edges[along, 1], 1] - xy[edges[along, 0], 1])
-    turn = ax * sy - ay * sx
-    if abs(turn) < _LEAST_TURN * math.hypot(ax, ay) * math.hypot(sx, sy):
-        return -1
-    # from w along its other edge to the line through v
-    share = ((xy[v, 0] - xy[w, 0]) * sy - (xy[v, 1] - xy[w, 1]) * sx) / turn
-    if abs(share) * math.hypot(ax, ay) > limits.corner_reach_m * 1e3:
-        return -1
-    trial = len(xy) - 1
-    xy[trial, 0], xy[trial, 1] = xy[w, 0] + round(share * ax), xy[w, 1] + round(share * ay)
-    return w
-
-
-@kernel(inline="always")
-def _cost_of_sliding(
-    borders: Borders, ends: Ends, buckets: Buckets, planes: FloatArray, w: int, limits: Limits
-) -> float:
-    """Unexplained points more if w goes where `_slid_end` puts it; infinite where it cannot."""
-    found = np.empty(MAX_DEGREE, np.int64)
-    m = edges_at(borders.edges, ends, w, found)
-    trial = len(borders.xy) - 1
-    if borders.xy[w, 0] == borders.xy[trial, 0] and borders.xy[w, 1] == borders.xy[trial, 1]:
-        return 0.0
-    cost = cost_of_moving(borders, buckets, planes, w, trial, found[:m], limits.cap_m)
-    return cost if star_is_sound(borders, planes, trial, w, found, m) else math.inf
 
 
 @kernel(inline="always")
@@ -218,7 +105,7 @@ def _gain_of_merging(
 ) -> float:
     """Points that merging a vertex of an edge into its other end gains; not positive where it cannot be done.
 
-    `way` is the edge, the vertex and the other end. A vertex `slid` goes where `_slid_end` puts it; -1 for none.
+    `way` is the edge, the vertex and the other end. A vertex `slid` goes where `slid_end` puts it; -1 for none.
     """
     edges = borders.edges
     edge, u, v = way
@@ -233,19 +120,19 @@ def _gain_of_merging(
     if gain <= 0.0:
         return 0.0
     if slid >= 0:
-        gain -= _cost_of_sliding(borders, ends, buckets, planes, slid, limits)
+        gain -= cost_of_sliding(borders, ends, buckets, planes, slid, limits)
     else:
-        gain -= limits.corner_cost * _TURN * _turned_steps(borders, planes, u, v, found[:m], limits.corner_gap_m)
+        gain -= limits.corner_cost * TURN * turned_steps(borders, planes, u, v, found[:m], limits.corner_gap_m)
     if gain <= 0.0:
         return 0.0
     xy, trial = borders.xy, len(borders.xy) - 1
-    x, y = xy[slid, 0], xy[slid, 1]
-    if slid >= 0:
-        xy[slid, 0], xy[slid, 1] = xy[trial, 0], xy[trial, 1]
+    moved = slid if slid >= 0 else trial
+    x, y = xy[moved, 0], xy[moved, 1]
+    xy[moved, 0], xy[moved, 1] = xy[trial, 0], xy[trial, 1]
     gain -= cost_of_moving(borders, buckets, planes, u, v, found[:m], limits.cap_m)
     if gain > 0.0 and not star_is_sound(borders, planes, v, u, found, m + m_v):
         gain = 0.0
-    xy[slid, 0], xy[slid, 1] = x, y
+    xy[moved, 0], xy[moved, 1] = x, y
     return gain
 
 
@@ -300,17 +187,17 @@ def merge_vertices(borders: Borders, points: FloatArray, planes: FloatArray, lim
                 one, other = edges[e, side], edges[e, 1 - side]
                 if one < 0:
                     continue
-                for sliding in range(2):
-                    w = _slid_end(tried, ends, planes, e, one, other, limits) if sliding == 1 else -1
-                    if sliding == 1 and w < 0:
-                        continue
+                w = slid_end(tried, ends, planes, e, one, other, limits)
+                gain = _gain_of_merging(tried, ends, buckets, planes, (e, one, other), w, limits) if w >= 0 else 0.0
+                if gain <= 0.0:
+                    w = -1
                     gain = _gain_of_merging(tried, ends, buckets, planes, (e, one, other), w, limits)
-                    if gain > best:
-                        best, u, v, slid = gain, one, other, w
+                if gain > best:
+                    best, u, v, slid = gain, one, other, w
             if u < 0:
                 continue
             if slid >= 0:
-                slid = _slid_end(tried, ends, planes, e, u, v, limits)
+                slid = slid_end(tried, ends, planes, e, u, v, limits)
                 xy[slid, 0], xy[slid, 1] = xy[-1, 0], xy[-1, 1]
             _merge(edges, ends, e, u, v, into)
             changed = True
