@@ -49,7 +49,7 @@ def _is_step(borders: Borders, planes: FloatArray, edge: int, gap_m: float) -> b
     a, b = edges[edge, 0], edges[edge, 1]
     one, other = planes[borders.plane_of_face[edges[edge, 2]]], planes[borders.plane_of_face[edges[edge, 3]]]
     x, y = 0.5e-3 * (xy[a, 0] + xy[b, 0]), 0.5e-3 * (xy[a, 1] + xy[b, 1])
-    return abs((one[0] - other[0]) * x + (one[1] - other[1]) * y + one[2] - other[2]) > gap_m
+    return bool(abs((one[0] - other[0]) * x + (one[1] - other[1]) * y + one[2] - other[2]) > gap_m)
 
 
 @kernel(inline="always")
@@ -128,7 +128,7 @@ def slid_end(borders: Borders, ends: Ends, planes: FloatArray, edge: int, u: int
             return -1
     trial = len(xy) - 1
     xy[trial, 0], xy[trial, 1] = xy[w, 0] + round(share * ax), xy[w, 1] + round(share * ay)
-    return w
+    return int(w)
 
 
 @kernel(inline="always")

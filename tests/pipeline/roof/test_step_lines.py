@@ -48,7 +48,8 @@ def border_between(drawn: RoofPartition) -> FloatArray:
     shared = shapely.intersection(low.boundary, high.boundary)
     line = shared if isinstance(shared, LineString) else shapely.line_merge(shared)
     assert isinstance(line, LineString)
-    return shapely.get_coordinates(affinity.rotate(line, -TURN_DEG, origin=(0, 0))) * 1e-3
+    vertices: FloatArray = shapely.get_coordinates(affinity.rotate(line, -TURN_DEG, origin=(0, 0))) * 1e-3
+    return vertices
 
 
 def directions_deg(vertices: FloatArray) -> list[float]:
