@@ -13,7 +13,7 @@ from pipeline.compiler import kernel
 from pipeline.errors import BuildingError
 from pipeline.model import FloatArray, IntArray, LabelArray, Plane, Reason
 from pipeline.roof.arrangement.arranged_faces import corners_of_borders, part_crossings, rings_of_faces, trace_faces
-from pipeline.roof.arrangement.candidate_lines import CandidateLines, border_places, candidate_lines
+from pipeline.roof.arrangement.candidate_lines import CandidateLines, candidate_lines, outline_directions
 from pipeline.roof.arrangement.far_corners import (
     HeightsAround,
     add_costs_of_far_planes,
@@ -31,6 +31,7 @@ from pipeline.roof.arrangement.moved_vertices import move_vertices
 from pipeline.roof.arrangement.plan_cells import cell_borders, cell_costs, cells_of_points, points_per_cell, unite_faces
 from pipeline.roof.arrangement.plane_refit import labels_of_points, refitted_planes, support_of_planes
 from pipeline.roof.arrangement.raster_labels import Limits, limits_at, raster_labels
+from pipeline.roof.arrangement.step_lines import border_places
 from pipeline.roof.arrangement.subdivision import CELLS, EDGES, VERTICES, Subdivision, subdivide, subdivision_of
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.roof_settings import ArrangementSettings
@@ -89,8 +90,7 @@ def _planes_and_lines(
         return refitted_planes(points, np.zeros(len(points), np.int32), planes, cap_m), lines
     labels, raster = raster_labels(points, planes, edges, limits.cell_m, cap_m, limits.cost_per_m)
     planes = refitted_planes(points, labels_of_points(points, labels, raster), planes, cap_m)
-    places, pairs = border_places(labels, raster, k)
-    lines = candidate_lines(places, pairs, points, planes, edges, raster.cell_m, cap_m, limits.line_length_m)
+    lines = candidate_lines(border_places(labels, raster, k), points, planes, edges, raster.cell_m, limits)
     return planes, with_guides(lines, guides, raster.cell_m, limits.line_length_m)
 
 
@@ -193,7 +193,8 @@ def _arranged(
     if n_faces > 1 and limits.clearance == 1.0:
         edges = edges_of_rings(xy, vertices, ring_starts, owner)
         mark_edges_on_guides(xy, edges, guides.pieces)
-        borders = Borders(xy, edges, plane_of_face, np.arange(len(xy)) < len(outline.xy))
+        directions = outline_directions(_outline_edges(outline))
+        borders = Borders(xy, edges, plane_of_face, np.arange(len(xy)) < len(outline.xy), directions)
         rings = vertices, ring_starts
         vertices, ring_starts, planes = clean_borders(borders, rings, points, label_of_point, planes, limits)
     support = support_of_planes(points, label_of_point, planes, limits.cap_m)

@@ -1,9 +1,9 @@
 """Candidate lines from the borders of coarse labels: where planes cross, else steps along the building's directions.
 
 A border between two labels is a set of places, each half-way between two neighbouring cells. Places near the line in
-which the two planes cross are a ridge, hip or valley and support that line exactly. The others are cut into steps:
-lines along the outline, a contour or a fall line of one of the planes, as long as they find enough places. Each line
-then moves to where it separates the points of the two planes at the least cost.
+which the two planes cross are a ridge, hip or valley and support that line exactly. The others are steps
+(`step_lines`): along the outline, a contour or a fall line of one of the planes where that describes them well. Each
+line then moves to where it separates the points of the two planes at the least cost.
 """
 
 from __future__ import annotations
@@ -14,9 +14,10 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.compiler import kernel
-from pipeline.kernels.sorting import ascending_order, in_order
+from pipeline.kernels.sorting import ascending_order
 from pipeline.model import FloatArray, IntArray, LabelArray
-from pipeline.roof.arrangement.raster_labels import Raster, vertical_distance_m
+from pipeline.roof.arrangement.raster_labels import Limits, vertical_distance_m
+from pipeline.roof.arrangement.step_lines import Border, chains_of, steps_of
 
 _MIN_SLOPE = 0.08
 """Difference of slopes below which two planes cross nowhere exactly: their noise moves the line by metres."""
@@ -26,10 +27,8 @@ _MAX_CROSSING_CELLS = 4.0
 """Farthest such place where planes differ so little that the points do not show their side; others are steps."""
 _NOISE_M = 0.1
 """Added to distances in cells: where cells are small, the noise of the points decides where a border lies."""
-_BAND_CELLS = 1.1
-"""Width of the band in which the places of one step lie, by the resolution of the labels."""
 _SHIFT_CELLS = 0.6
-"""How far a step may move from the middle of its band: little more than half its width."""
+"""How far a step may move from the middle of its places."""
 _CROSSING_BONUS = 1.5
 """A crossing comes before a step with as many places, since its position is exact. Decides only an order."""
 _MIN_EDGE_M = 1.0
@@ -64,7 +63,7 @@ class CandidateLines(NamedTuple):
 
 
 @kernel
-def _outline_directions(edges: FloatArray) -> FloatArray:
+def outline_directions(edges: FloatArray) -> FloatArray:
     """Directions of the long edges (e, 4) of an outline and those square to them, longest first, in [0, pi), (n,)."""
     shortness = np.empty(len(edges))
     for e in range(len(edges)):
@@ -101,62 +100,6 @@ def _with_directions_of(plane: FloatArray, directions: FloatArray, n: int) -> in
         n = _with_direction(directions, n, fall % math.pi)
         n = _with_direction(directions, n, (fall + math.pi / 2) % math.pi)
     return n
-
-
-@kernel
-def border_places(labels: LabelArray, raster: Raster, n_planes: int) -> tuple[FloatArray, IntArray]:
-    """Places (m, 2) in metres amid neighbouring cells of different labels, ordered by their pair of labels.
-
-    Also returns those pairs, (m,) int64: low * n_planes + high, ascending.
-    """
-    place, columns = raster.place, raster.columns
-    places = np.empty((2 * len(place), 2))
-    pairs = np.empty(2 * len(place), np.int64)
-    m = 0
-    for i in range(len(place)):
-        r, c = place[i] // columns, place[i] % columns
-        for step in range(2):
-            if (c + 1 >= columns) if step == 0 else (r + 1 >= raster.rows):
-                continue
-            j = raster.number[place[i] + (1 if step == 0 else columns)]
-            if j < 0 or labels[j] == labels[i]:
-                continue
-            places[m, 0] = raster.west + (c + 0.5 + 0.5 * (step == 0)) * raster.cell_m
-            places[m, 1] = raster.south + (r + 0.5 + 0.5 * (step == 1)) * raster.cell_m
-            pairs[m] = np.int64(min(labels[i], labels[j])) * n_planes + max(labels[i], labels[j])
-            m += 1
-    order = ascending_order(pairs[:m])
-    ordered, ordered_pairs = np.empty((m, 2)), np.empty(m, np.int64)
-    for s in range(m):
-        ordered[s, 0], ordered[s, 1] = places[order[s], 0], places[order[s], 1]
-        ordered_pairs[s] = pairs[order[s]]
-    return ordered, ordered_pairs
-
-
-@kernel
-def _best_band(
-    places: FloatArray, first: int, last: int, line_of: LabelArray, directions: FloatArray, n: int, band_m: float
-) -> tuple[int, float, float]:
-    """How many places, the direction and offset of the band that holds most of first..last without a line yet."""
-    most, best_angle, best_offset = 0, 0.0, 0.0
-    offsets = np.empty(last - first)
-    for d in range(n):
-        across_x, across_y = -math.sin(directions[d]), math.cos(directions[d])
-        m = 0
-        for q in range(first, last):
-            if line_of[q] < 0:
-                offsets[m] = across_x * places[q, 0] + across_y * places[q, 1]
-                m += 1
-        ordered = in_order(offsets[:m])
-        end = 0
-        for begin in range(m):
-            while end < m and ordered[end] <= ordered[begin] + band_m:
-                end += 1
-            if end - begin > most:
-                most = end - begin
-                best_angle = directions[d]
-                best_offset = 0.5 * (ordered[begin] + ordered[end - 1])
-    return most, best_angle, best_offset
 
 
 @kernel
@@ -226,38 +169,48 @@ def _take_places(
     return taken
 
 
+@kernel(inline="always")
+def _take_step(
+    places: FloatArray,
+    chain: IntArray,
+    begin: int,
+    end: int,
+    angle: float,
+    line: FloatArray,
+    line_of: LabelArray,
+    number: int,
+) -> tuple[float, float]:
+    """Give places of a chain the number of their step, and draw its line amid them; its begin and end along it."""
+    line[0], line[1], line[2] = -math.sin(angle), math.cos(angle), 0.0
+    low, high = math.inf, -math.inf
+    for s in range(begin, end + 1):
+        q = chain[s % len(chain)]
+        line_of[q] = number
+        line[2] -= (line[0] * places[q, 0] + line[1] * places[q, 1]) / (end + 1 - begin)
+        along = -line[1] * places[q, 0] + line[0] * places[q, 1]
+        low, high = min(low, along), max(high, along)
+    return low, high
+
+
 @kernel
 def candidate_lines(
-    places: FloatArray,
-    pairs: IntArray,
-    points: FloatArray,
-    planes: FloatArray,
-    edges: FloatArray,
-    cell_m: float,
-    cap_m: float,
-    min_length_m: float,
+    border: Border, points: FloatArray, planes: FloatArray, edges: FloatArray, cell_m: float, limits: Limits
 ) -> CandidateLines:
     """Lines along the `border_places` of coarse labels of planes (k, 3) through roof points (n, 3).
 
-    Parameters
-    ----------
-    edges : (e, 4) float64
-        Edges of the outline, metres.
-    cell_m : float
-        Cell of the labels.
-    cap_m : float
-        Residual from which a point is unexplained.
-    min_length_m : float
-        Shorter borders give no line.
+    `edges` (e, 4) are those of the outline in metres, `cell_m` is the cell of the labels.
     """
+    places, pairs = border.places, border.pairs
     k = len(planes)
     m = len(places)
-    least = max(2, math.ceil(min_length_m / cell_m))
+    cap_m, spacing_m = limits.cap_m, 1.0 / math.sqrt(limits.points_per_m2)
+    least = max(2, math.ceil(limits.line_length_m / cell_m))
+    at = np.zeros((border.corners, 3), np.int64)
     lines = np.empty((m + 1, 3))
     scores = np.empty(m + 1)
     crossing = np.zeros(m + 1, np.int32)
     line_of = np.full(m, -1, np.int32)
-    outline = _outline_directions(edges)
+    outline = outline_directions(edges)
     directions = np.empty(len(outline) + _DIRECTIONS_OF_PLANES)
     difference = np.empty(3)
     n_lines = 0
@@ -267,7 +220,6 @@ def candidate_lines(
         while last < m and pairs[last] == pairs[first]:
             last += 1
         one, other = pairs[first] // k, pairs[first] % k
-        free = last - first
         for axis in range(3):
             difference[axis] = planes[one, axis] - planes[other, axis]
         turn = math.hypot(difference[0], difference[1])
@@ -280,7 +232,6 @@ def candidate_lines(
                     lines[n_lines, axis] = difference[axis] / turn
                 scores[n_lines] = _CROSSING_BONUS * on_line
                 crossing[n_lines] = 1
-                free -= on_line
                 n_lines += 1
             else:
                 line_of[first:last] = -1
@@ -289,31 +240,26 @@ def candidate_lines(
             directions[q] = outline[q]
         n = _with_directions_of(planes[one], directions, n)
         n = _with_directions_of(planes[other], directions, n)
-        while free >= least:
-            most, angle, offset = _best_band(places, first, last, line_of, directions, n, _BAND_CELLS * cell_m)
-            if most < least:
-                break
-            line = lines[n_lines]
-            line[0], line[1], line[2] = -math.sin(angle), math.cos(angle), -offset
-            low, high = math.inf, -math.inf
-            for q in range(first, last):
-                off = line[0] * places[q, 0] + line[1] * places[q, 1] + line[2]
-                if line_of[q] < 0 and abs(off) <= 0.5 * _BAND_CELLS * cell_m + _ROUNDING:
-                    line_of[q] = n_lines
-                    free -= 1
-                    along = -line[1] * places[q, 0] + line[0] * places[q, 1]
-                    low, high = min(low, along), max(high, along)
-            reach_m = _SHIFT_CELLS * cell_m + _NOISE_M
-            half = 0.5 * cell_m
-            shift = _parting_shift(points, planes, (one, other), line, low - half, high + half, cap_m, reach_m)
-            if not math.isnan(shift):
-                line[2] -= shift
-            elif turn > _MIN_SLOPE:
-                # a border in a gap of the points lies anywhere: it is where the planes themselves meet
-                for axis in range(3):
-                    line[axis] = difference[axis] / turn
-                crossing[n_lines] = 1
-            scores[n_lines] = most
-            n_lines += 1
+        order, starts = chains_of(border, first + np.flatnonzero(line_of[first:last] < 0), at)
+        for c in range(len(starts) - 1):
+            chain = order[starts[c] : starts[c + 1]]
+            if len(chain) < least:
+                continue
+            ends, angles = steps_of(border, chain, directions[:n], spacing_m)
+            for e in range(len(angles)):
+                line = lines[n_lines]
+                low, high = _take_step(places, chain, ends[e], ends[e + 1], angles[e], line, line_of, n_lines)
+                reach_m = _SHIFT_CELLS * cell_m + _NOISE_M
+                half = 0.5 * cell_m
+                shift = _parting_shift(points, planes, (one, other), line, low - half, high + half, cap_m, reach_m)
+                if not math.isnan(shift):
+                    line[2] -= shift
+                elif turn > _MIN_SLOPE:
+                    # a border in a gap of the points lies anywhere: it is where the planes themselves meet
+                    for axis in range(3):
+                        line[axis] = difference[axis] / turn
+                    crossing[n_lines] = 1
+                scores[n_lines] = ends[e + 1] - ends[e] + 1
+                n_lines += 1
         first = last
     return CandidateLines(lines[:n_lines].copy(), scores[:n_lines].copy(), crossing[:n_lines].copy(), places, line_of)

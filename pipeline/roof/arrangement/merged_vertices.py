@@ -2,7 +2,8 @@
 
 A vertex of the faces' borders is worth a few points (minimum description length). It is merged with a neighbour where
 that changes the costs of the points by less: jogs of steps become straight, clusters of vertices become one, a hip that
-ends beside a corner of the outline ends in it. Vertices of the given outline stay, and others on it move along it.
+ends beside a corner of the outline ends in it. Vertices of the given outline stay, and others on it move along it. A
+step along the outline pays for a direction of its own, so it moves as a whole: its other end slides with it.
 """
 
 from __future__ import annotations
@@ -14,12 +15,14 @@ import numpy as np
 from pipeline.compiler import kernel
 from pipeline.kernels.sorting import ascending_order
 from pipeline.model import FloatArray, IntArray
+from pipeline.roof.arrangement.kept_directions import TURN, cost_of_sliding, slid_end, turned_steps
 from pipeline.roof.arrangement.movable_borders import (
     KEEPS,
     MAX_DEGREE,
     Borders,
     Buckets,
     Ends,
+    are_parallel,
     buckets_of,
     cost_of_moving,
     edges_at,
@@ -28,8 +31,6 @@ from pipeline.roof.arrangement.movable_borders import (
 )
 from pipeline.roof.arrangement.raster_labels import Limits
 
-_ONE_WAY = 0.1
-"""Sine of the angle below which edges have one direction."""
 _ROUNDS = 8
 """Most turns through all edges: bounds the work; it ends as soon as nothing changes."""
 
@@ -79,15 +80,6 @@ def _corners_saved(
 
 
 @kernel(inline="always")
-def _are_parallel(xy: IntArray, edges: IntArray, one: int, other: int) -> bool:
-    """Whether two edges have one direction, but for what rounding to 1 mm and passing through vertices turn them."""
-    ax, ay = xy[edges[one, 1], 0] - xy[edges[one, 0], 0], xy[edges[one, 1], 1] - xy[edges[one, 0], 1]
-    bx, by = xy[edges[other, 1], 0] - xy[edges[other, 0], 0], xy[edges[other, 1], 1] - xy[edges[other, 0], 1]
-    turned = abs(float(ax * by - ay * bx))
-    return turned <= _ONE_WAY * math.hypot(float(ax), float(ay)) * math.hypot(float(bx), float(by))
-
-
-@kernel(inline="always")
 def _may_move(borders: Borders, edge: int, found: IntArray, m: int, reach_m: float) -> bool:
     """Whether the vertex with the m found edges may move along one of them: on outline or guide, and not too far."""
     xy, edges = borders.xy, borders.edges
@@ -95,7 +87,7 @@ def _may_move(borders: Borders, edge: int, found: IntArray, m: int, reach_m: flo
     on_outline = False
     for s in range(m):
         on_outline = on_outline or edges[found[s], 3] < 0
-        if edges[found[s], KEEPS] != 0 and not _are_parallel(xy, edges, edge, found[s]):
+        if edges[found[s], KEEPS] != 0 and not are_parallel(xy, edges, edge, found[s]):
             return False
     is_far = math.hypot(float(xy[a, 0] - xy[b, 0]), float(xy[a, 1] - xy[b, 1])) > reach_m * 1e3
     return not (is_far and m > 2) and not (on_outline and edges[edge, 3] >= 0)
@@ -103,10 +95,20 @@ def _may_move(borders: Borders, edge: int, found: IntArray, m: int, reach_m: flo
 
 @kernel(inline="always")
 def _gain_of_merging(
-    borders: Borders, ends: Ends, buckets: Buckets, planes: FloatArray, edge: int, u: int, v: int, limits: Limits
+    borders: Borders,
+    ends: Ends,
+    buckets: Buckets,
+    planes: FloatArray,
+    way: tuple[int, int, int],
+    slid: int,
+    limits: Limits,
 ) -> float:
-    """Points that merging vertex u of an edge into its other end v gains; not positive where it cannot be done."""
+    """Points that merging a vertex of an edge into its other end gains; not positive where it cannot be done.
+
+    `way` is the edge, the vertex and the other end. A vertex `slid` goes where `slid_end` puts it; -1 for none.
+    """
     edges = borders.edges
+    edge, u, v = way
     found = np.empty(2 * MAX_DEGREE, np.int64)
     m = edges_at(edges, ends, u, found[:MAX_DEGREE])
     if borders.is_fixed[u] or m > MAX_DEGREE or not _may_move(borders, edge, found, m, limits.corner_reach_m):
@@ -117,9 +119,20 @@ def _gain_of_merging(
     gain = limits.corner_cost * _corners_saved(borders, planes, u, v, found, m, m_v, limits.corner_gap_m)
     if gain <= 0.0:
         return 0.0
+    if slid >= 0:
+        gain -= cost_of_sliding(borders, ends, buckets, planes, slid, limits)
+    else:
+        gain -= limits.corner_cost * TURN * turned_steps(borders, planes, u, v, found[:m], limits.corner_gap_m)
+    if gain <= 0.0:
+        return 0.0
+    xy, trial = borders.xy, len(borders.xy) - 1
+    moved = slid if slid >= 0 else trial
+    x, y = xy[moved, 0], xy[moved, 1]
+    xy[moved, 0], xy[moved, 1] = xy[trial, 0], xy[trial, 1]
     gain -= cost_of_moving(borders, buckets, planes, u, v, found[:m], limits.cap_m)
     if gain > 0.0 and not star_is_sound(borders, planes, v, u, found, m + m_v):
-        return 0.0
+        gain = 0.0
+    xy[moved, 0], xy[moved, 1] = x, y
     return gain
 
 
@@ -162,21 +175,35 @@ def merge_vertices(borders: Borders, points: FloatArray, planes: FloatArray, lim
     if len(points) == 0 or limits.corner_cost == 0.0:
         return into
     buckets = buckets_of(points)
-    ends = ends_at_vertices(borders)
+    # one row more, in which places are tried
+    xy = np.concatenate((borders.xy, np.zeros((1, 2), np.int64)))
+    tried = Borders(xy, edges, borders.plane_of_face, borders.is_fixed, borders.directions)
+    ends = ends_at_vertices(tried)
     for _ in range(_ROUNDS):
         changed = False
-        for e in _shortest_first(borders):
-            best, u, v = 0.0, -1, -1
+        for e in _shortest_first(tried):
+            best, u, v, slid = 0.0, -1, -1, -1
             for side in range(2):
                 one, other = edges[e, side], edges[e, 1 - side]
-                gain = _gain_of_merging(borders, ends, buckets, planes, e, one, other, limits) if one >= 0 else 0.0
+                if one < 0:
+                    continue
+                w = slid_end(tried, ends, planes, e, one, other, limits)
+                gain = _gain_of_merging(tried, ends, buckets, planes, (e, one, other), w, limits) if w >= 0 else 0.0
+                if gain <= 0.0:
+                    w = -1
+                    gain = _gain_of_merging(tried, ends, buckets, planes, (e, one, other), w, limits)
                 if gain > best:
-                    best, u, v = gain, one, other
-            if u >= 0:
-                _merge(edges, ends, e, u, v, into)
-                changed = True
+                    best, u, v, slid = gain, one, other, w
+            if u < 0:
+                continue
+            if slid >= 0:
+                slid = slid_end(tried, ends, planes, e, u, v, limits)
+                xy[slid, 0], xy[slid, 1] = xy[-1, 0], xy[-1, 1]
+            _merge(edges, ends, e, u, v, into)
+            changed = True
         if not changed:
             break
+    borders.xy[:] = xy[:-1]
     return into
 
 

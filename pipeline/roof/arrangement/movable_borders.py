@@ -21,6 +21,8 @@ _CLEARANCE_MM = 25.0
 """Moved borders keep this far from vertices; numerical guard of solids, whose vertices must stay distinct."""
 _BUCKET_M = 1.0
 """Side of the squares by which points are sorted; changes the speed only."""
+_ONE_WAY = 0.1
+"""Sine of the angle below which edges have one direction."""
 MAX_DEGREE = 16
 """Vertices with more edges stay."""
 
@@ -40,6 +42,8 @@ class Borders(NamedTuple):
     """(f,) int32."""
     is_fixed: BoolArray
     """(v,), the vertices of the outline."""
+    directions: FloatArray = np.empty(0)
+    """(d,) float64, those of the outline, which steps keep, radians."""
 
 
 class Ends(NamedTuple):
@@ -139,6 +143,15 @@ def edges_of_rings(xy: IntArray, vertices: IntArray, starts: IntArray, owner: La
             m += 1
         before = keys[s]
     return edges[:m].copy()
+
+
+@kernel(inline="always")
+def are_parallel(xy: IntArray, edges: IntArray, one: int, other: int) -> bool:
+    """Whether two edges have one direction, but for what rounding to 1 mm and passing through vertices turn them."""
+    ax, ay = xy[edges[one, 1], 0] - xy[edges[one, 0], 0], xy[edges[one, 1], 1] - xy[edges[one, 0], 1]
+    bx, by = xy[edges[other, 1], 0] - xy[edges[other, 0], 0], xy[edges[other, 1], 1] - xy[edges[other, 0], 1]
+    turned = abs(float(ax * by - ay * bx))
+    return turned <= _ONE_WAY * math.hypot(float(ax), float(ay)) * math.hypot(float(bx), float(by))
 
 
 @kernel

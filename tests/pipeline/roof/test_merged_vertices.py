@@ -58,6 +58,16 @@ def test_a_jog_smaller_than_the_points_show_goes_and_the_outline_stays() -> None
     assert abs(shapely.Polygon(low).area - 4050 * 6000) <= 50 * 6000 + 1
 
 
+def test_a_step_along_the_outline_stays_parallel_to_it_when_its_jog_goes() -> None:
+    step = Step(0.1)
+    step.borders = step.borders._replace(directions=np.array([0.0, 0.5 * np.pi]))
+    low, high = step.merged()
+    assert len(low) == len(high) == 4
+    east = max(x for x, _ in low)
+    assert east in (4000, 4100)
+    assert sorted(low) == [(0, 0), (0, 6000), (east, 0), (east, 6000)]
+
+
 def test_a_jog_that_many_points_show_stays() -> None:
     assert [len(ring) for ring in Step(1.5).merged()] == [6, 6]
 
