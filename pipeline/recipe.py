@@ -110,10 +110,7 @@ def _reconstruct(
             plan = partition_roof(roof, segmentation.planes, settings.roof)
             forms = traced_forms(plan, roof, settings.roof)
         model, codes = first_valid(
-            (
-                dataclasses.replace(form, draw=partial(own_model, building, segmentation, roof, form))
-                for form in forms
-            ),
+            (dataclasses.replace(form, draw=partial(own_model, building, segmentation, roof, form)) for form in forms),
             building,
         )
         if model is not None:

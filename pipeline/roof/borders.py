@@ -1,9 +1,9 @@
 """Straight borders between roof faces: ridges where planes cross, steps along fitted lines.
 
-The borders of a partition are arcs between nodes, where three or more borders meet. An arc is cut into runs. A run
-along which the two planes cross takes their line of intersection; any other run takes its least-squares line, turned to
-a dominant direction of the building if that is near. Nodes move to where their lines meet; nodes on the outline move
-along it. If a face breaks, its arcs are restored, so the result is always a coverage.
+The borders of a partition are arcs between nodes, where three or more borders meet. An arc takes its shortest
+description (`outlines/description.py`). An edge along which the two planes cross takes their line of intersection; any
+other edge its own line, or one in a common direction of the building. Nodes move to where their lines meet; nodes on
+the outline move along it. If a face breaks, its arcs are restored, so the result is always a coverage.
 """
 
 from __future__ import annotations
@@ -17,15 +17,20 @@ import numpy as np
 import shapely
 
 from pipeline.model import Plane
-from pipeline.roof.lines import Point, Run, corners, crossing, dominant_direction, fitted_run, merge, split, square
+from pipeline.roof.lines import Point, Run, corners, crossing, fitted_run
+from pipeline.roof.outlines.description import Prices
+from pipeline.roof.outlines.exterior import described_chain, pairs_of, peaks_of
 from pipeline.roof.partition import RoofPartition
-from pipeline.roof.roof_settings import RoofSettings
 from pipeline.roof.snapped_rings import differ_by_more
 
 _ROUNDS = 4
 """Most rounds in which arcs of broken faces are put back; then nothing is straightened."""
-_MERGE = 1.3
-"""Runs are one while a single line passes within this many tolerances of all their vertices."""
+_TOLERANCE_SPACINGS = 0.65
+"""How far borders and nodes may move, in point spacings."""
+_NOISE_SPACINGS = 0.3
+"""Standard deviation of a border about its line: it lies between points of either side."""
+_PRICES = Prices(edge=4.0, free=4.0, change=0.0, sharp=60.0, flat=20.0)
+"""Slopes meet in any direction: a direction of its own costs less than in an outline."""
 _MIN_SLOPE = 0.05
 """Planes whose slopes differ by less cross nowhere exactly: their noise moves the line."""
 
@@ -49,14 +54,12 @@ class _Arc:
         return self.path[0] == self.path[-1]
 
 
-def straighten_borders(
-    partition: RoofPartition, planes: Sequence[Plane], spacing_m: float, settings: RoofSettings
-) -> RoofPartition:
+def straighten_borders(partition: RoofPartition, planes: Sequence[Plane], spacing_m: float) -> RoofPartition:
     """Draw the borders between roof faces as straight lines, leaving the outline, in a coverage in integer millimetres.
 
     The tolerances are multiples of the point spacing. The same object comes back where nothing could be straightened.
     """
-    tolerance = settings.border_tolerance_spacings * spacing_m * 1e3
+    tolerance = _TOLERANCE_SPACINGS * spacing_m * 1e3
     arcs, rings = _arcs(partition)
     outline_runs = [
         fitted_run(np.array([a, b]), 0, 1)
@@ -64,12 +67,11 @@ def straighten_borders(
         if min(arc.left, arc.right) < 0
         for a, b in itertools.pairwise(arc.path)
     ]
-    dominant = dominant_direction(outline_runs)
-    within = math.radians(settings.square_within_deg)
+    common = peaks_of(outline_runs)[:1]
     for arc in arcs:
         if min(arc.left, arc.right) >= 0:
-            _fit(arc, planes[partition.labels[arc.left]], planes[partition.labels[arc.right]], tolerance)
-            square(arc.runs, dominant, within, tolerance)
+            left, right = planes[partition.labels[arc.left]], planes[partition.labels[arc.right]]
+            _fit(arc, left, right, common, spacing_m)
             arc.straight = bool(arc.runs)
     before = np.array(partition.polygons, dtype=object)
     for _ in range(_ROUNDS):
@@ -126,25 +128,24 @@ def _arcs(partition: RoofPartition) -> tuple[list[_Arc], list[list[list[tuple[in
     return arcs, rings_of_arcs
 
 
-def _fit(arc: _Arc, left: Plane, right: Plane, tolerance: float) -> None:
-    """Cut an arc into runs and give each its line."""
-    border = np.array(arc.path[:-1] if arc.closed else arc.path)
-    runs = split(border, tolerance, closed=arc.closed)
+def _fit(arc: _Arc, left: Plane, right: Plane, common: Sequence[float], spacing_m: float) -> None:
+    """Describe an arc by edges: along the crossing of its planes, in a common direction, or in others."""
+    border = np.array(arc.path)
     da, db, dc = left.a - right.a, left.b - right.b, (left.c - right.c) * 1e3
     slope = math.hypot(da, db)
-    if slope > _MIN_SLOPE:
-        for run in runs:
-            piece = border[np.arange(run.first, run.last + 1) % len(border)]
-            off = float(np.median(np.abs(piece[:, 0] * da + piece[:, 1] * db + dc))) / slope
-            if off <= 0.6 * tolerance:
-                run.exact = True
-                shift = (run.x * da + run.y * db + dc) / (slope * slope)
-                run.x -= shift * da
-                run.y -= shift * db
-                along = math.atan2(da, -db)
-                run.direction = along if math.cos(along - run.direction) >= 0.0 else along + math.pi
-    runs = merge(border, runs, _MERGE * tolerance, closed=arc.closed)
-    for run in runs:
+    crosses = slope > _MIN_SLOPE
+    directions = np.append(pairs_of(common), [math.atan2(da, -db)] if crosses else [])
+    noise_mm = _NOISE_SPACINGS * spacing_m * 1e3
+    for run in described_chain(border, directions, 1e3 * spacing_m, noise_mm, _PRICES):
+        run.exact = False
+        piece = border[run.first : run.last + 1]
+        if crosses and float(np.median(np.abs(piece[:, 0] * da + piece[:, 1] * db + dc))) <= slope * 2.0 * noise_mm:
+            run.exact = True
+            shift = (run.x * da + run.y * db + dc) / (slope * slope)
+            run.x -= shift * da
+            run.y -= shift * db
+            along = math.atan2(da, -db)
+            run.direction = along if math.cos(along - run.direction) >= 0.0 else along + math.pi
         if arc.runs and run.exact and arc.runs[-1].exact:
             # one line of intersection, whatever the number of runs along it
             arc.runs[-1].last = run.last

@@ -1,8 +1,4 @@
-"""Straight lines through stretches of a ragged border.
-
-A border is cut into runs by Douglas and Peucker's rule (1973). Its chords end at the extremes of the zigzag, so
-neighbouring runs are united again while one line of least squares passes near all their vertices.
-"""
+"""Straight lines through stretches of a ragged border, and the corners where they meet."""
 
 from __future__ import annotations
 
@@ -10,8 +6,6 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Sequence
-
-import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.model import FloatArray
@@ -89,86 +83,6 @@ def _fit(border: FloatArray, first: int, last: int) -> tuple[float, float, float
 
 
 @kernel
-def _off_line(border: FloatArray, first: int, last: int, x: float, y: float, direction: float) -> float:
-    """Largest distance of a stretch's vertices from a line, in the unit of the coordinates."""
-    ux, uy = math.cos(direction), math.sin(direction)
-    largest = 0.0
-    for i in range(first, last + 1):
-        k = i % len(border)
-        largest = max(largest, abs(ux * (border[k, 1] - y) - uy * (border[k, 0] - x)))
-    return largest
-
-
-def split(border: FloatArray, tolerance: float, *, closed: bool) -> list[Run]:
-    """Cut a border into runs whose vertices lie within the tolerance, in the unit of the coordinates, of their chords.
-
-    The first vertex of a closed border (n, 2), whose last is joined to it, is not repeated, and a run starts there.
-    Such a border has at least three runs, or none.
-    """
-    return _as_runs(_split(border, tolerance, closed))
-
-
-def merge(border: FloatArray, runs: Sequence[Run], tolerance: float, *, closed: bool) -> list[Run]:
-    """Unite neighbouring runs while one line passes within the tolerance of all their vertices, the best pair first.
-
-    Vertices and tolerance are as for `split`; exact runs stay, and of a closed border at least three runs.
-    """
-    least = 3 if closed else 1
-    if len(runs) <= least:
-        return list(runs)
-    rows = [(run.first, run.last, run.x, run.y, run.direction, run.length, run.exact) for run in runs]
-    return _as_runs(_merge(border, np.array(rows, np.float64), tolerance, least))
-
-
-def _as_runs(rows: FloatArray) -> list[Run]:
-    """Runs from rows of their fields, (r, 7)."""
-    return [
-        Run(first=int(first), last=int(last), x=x, y=y, direction=direction, length=length, exact=bool(exact))
-        for first, last, x, y, direction, length, exact in rows.tolist()
-    ]
-
-
-@kernel
-def _fitted_row(border: FloatArray, first: int, last: int) -> tuple[float, float, float, float, float, float, float]:
-    """The fields of `fitted_run`."""
-    x, y, direction, length = _fit(border, first, last)
-    return float(first), float(last), x, y, direction, length, 0.0
-
-
-@kernel
-def _split(border: FloatArray, tolerance: float, closed: bool) -> FloatArray:
-    """The kernel of `split`, a row of fields per run (r, 7): the farthest vertex ends a run if it is too far."""
-    n = len(border)
-    count = n if closed else n - 1
-    ends = np.zeros(count + 1, np.bool_)
-    ends[0] = ends[count] = True
-    starts, stops = np.empty(count + 1, np.int64), np.empty(count + 1, np.int64)
-    starts[0], stops[0] = 0, count
-    left = 1
-    while left > 0:
-        left -= 1
-        i, j = starts[left], stops[left]
-        farthest, at = -1.0, i
-        for k in range(i + 1, j):
-            off = off_piece(border[i], border[j % n], border[k])
-            if off > farthest:
-                farthest, at = off, k
-        if farthest > tolerance:
-            ends[at] = True
-            # no more than `count` pieces wait, as each is a part of its own
-            starts[left], stops[left] = i, at
-            starts[left + 1], stops[left + 1] = at, j
-            left += 2
-    kept = np.flatnonzero(ends)
-    if closed and len(kept) < 4:
-        return np.empty((0, 7))
-    rows = np.empty((len(kept) - 1, 7))
-    for r in range(len(rows)):
-        rows[r] = _fitted_row(border, kept[r], kept[r + 1])
-    return rows
-
-
-@kernel
 def off_piece(a: FloatArray, b: FloatArray, p: FloatArray) -> float:
     """Distance of a point from the piece between two others, all (2,)."""
     ux, uy = b[0] - a[0], b[1] - a[1]
@@ -180,65 +94,6 @@ def off_piece(a: FloatArray, b: FloatArray, p: FloatArray) -> float:
     if along >= 1.0:
         return math.sqrt((p[0] - b[0]) ** 2 + (p[1] - b[1]) ** 2)
     return float(abs((y * ux - x * uy) / squared) * math.sqrt(squared))
-
-
-@kernel
-def _merge(border: FloatArray, runs: FloatArray, tolerance: float, least: int) -> FloatArray:
-    """The kernel of `merge`, rows of fields (r, 7); of a closed border at least three runs stay, of an open one one."""
-    closed = least > 1
-    count = len(runs)
-    merged, pairs, offs = runs.copy(), np.empty((count, 7)), np.full(count, np.inf)
-    for k in range(count):
-        offs[k] = _off_united(border, merged, k, closed, pairs[k])
-    while count > least:
-        k = int(np.argmin(offs[:count]))
-        if offs[k] > tolerance:
-            break
-        merged[k] = pairs[k]
-        following = (k + 1) % count
-        for i in range(following, count - 1):
-            merged[i], pairs[i], offs[i] = merged[i + 1], pairs[i + 1], offs[i + 1]
-        count -= 1
-        k -= following < k
-        for i in (k, (k - 1) % count):
-            offs[i] = _off_united(border, merged[:count], i, closed, pairs[i])
-    return merged[:count].copy()
-
-
-@kernel
-def _off_united(border: FloatArray, runs: FloatArray, k: int, closed: bool, united: FloatArray) -> float:
-    """How far vertices are from the line of a run and its successor, whose fields `united` takes; else infinite."""
-    a, b = runs[k], runs[(k + 1) % len(runs)]
-    if a[6] != 0.0 or b[6] != 0.0 or (k + 1 == len(runs) and not closed):
-        return np.inf
-    last = int(b[1]) + (len(border) if b[1] <= a[0] else 0)
-    united[:] = _fitted_row(border, int(a[0]), last)
-    return _off_line(border, int(a[0]), last, united[2], united[3], united[4])
-
-
-def dominant_direction(runs: Sequence[Run]) -> float | None:
-    """The direction, modulo a right angle, that most of the runs' squared length follows; None where there is none."""
-    weights = [run.length**2 for run in runs]
-    cosine = math.fsum(w * math.cos(4.0 * run.direction) for w, run in zip(weights, runs, strict=True))
-    sine = math.fsum(w * math.sin(4.0 * run.direction) for w, run in zip(weights, runs, strict=True))
-    if not runs or math.hypot(cosine, sine) < 0.5 * math.fsum(weights):
-        return None
-    return math.atan2(sine, cosine) / 4.0
-
-
-def square(runs: Sequence[Run], dominant: float | None, within: float, tolerance: float) -> None:
-    """Give runs near the dominant direction (radians), or square to it, that direction, in place; exact ones stay.
-
-    "Near" is `within`, radians, or for short runs, which are less certain, the tolerance over their length.
-    """
-    if dominant is None:
-        return
-    quarter = 0.5 * math.pi
-    for run in runs:
-        turns = round((run.direction - dominant) / quarter)
-        off = abs(run.direction - dominant - turns * quarter)
-        if not run.exact and off <= max(within, math.atan2(tolerance, run.length)):
-            run.direction = dominant + turns * quarter
 
 
 def crossing(a: Run, b: Run) -> Point | None:

@@ -30,10 +30,10 @@ from pipeline.model import (
 from pipeline.registry import extra
 from pipeline.roof.arrangement.arranging import arrange
 from pipeline.roof.arrangement.guide_lines import NO_GUIDES, Guides
-from pipeline.roof.outlines.exterior import straighten
 from pipeline.roof.edge_position import EdgePoints, mixed_pulse_reach_mm
 from pipeline.roof.footprint import outline
 from pipeline.roof.labelling import continue_crossings, empty_samples, fill_labels
+from pipeline.roof.outlines.exterior import straighten
 from pipeline.roof.partition import OUTSIDE, MinAreas, RoofPartition, absorb_small_regions, march
 from pipeline.roof.roof_settings import ArrangementSettings, RoofSettings
 from pipeline.tin.delaunay import triangulate

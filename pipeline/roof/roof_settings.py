@@ -107,35 +107,21 @@ class RoofSettings(Parameters):
     straight_eaves: bool = parameter(
         True, "Whether the outline is drawn with straight lines where no footprint is given."
     )
-    eave_tolerance_spacings: float = parameter(
-        1.2,
-        "How far the raw outline may lie from its straight lines.",
-        unit="point spacings",
-        minimum=0.2,
-        maximum=5.0,
-    )
-    min_eave_tolerance_m: float = parameter(
+    outline_noise_spacings: float = parameter(
         0.4,
+        "Standard deviation of the raw outline about its edges: with less, the outline gets more edges.",
+        unit="point spacings",
+        minimum=0.05,
+        maximum=2.0,
+    )
+    min_outline_noise_m: float = parameter(
+        0.25,
         "The same at least, where points are dense: gutters, plants and lost pulses make an eave as ragged.",
         unit="m",
-        minimum=0.0,
-        maximum=5.0,
+        minimum=0.02,
+        maximum=2.0,
     )
     straight_borders: bool = parameter(True, "Whether borders between roof faces are drawn with straight lines.")
-    border_tolerance_spacings: float = parameter(
-        0.65,
-        "How far a border between roof faces may lie from its straight lines.",
-        unit="point spacings",
-        minimum=0.1,
-        maximum=5.0,
-    )
-    square_within_deg: float = parameter(
-        12.0,
-        "An outline's line takes the dominant direction, or the one square to it, when it is this close.",
-        unit="deg",
-        minimum=0.0,
-        maximum=30.0,
-    )
     void_distance_m: float = parameter(
         4.0,
         "Inside a given footprint a place farther than this from every roof point is not roof.",

@@ -87,7 +87,7 @@ def draw_clipped(plan: RoofPlan, roof: RoofPoints, settings: RoofSettings, form:
         outline_mm = MultiPolygon(polygons_of(drawn_back))
     partition = clip_partition(plan.faces, outline_mm, min_face_area(roof, settings))
     if form.straight and settings.straight_borders:
-        partition = straighten_borders(partition, plan.planes, roof.spacing_m, settings)
+        partition = straighten_borders(partition, plan.planes, roof.spacing_m)
     tolerance = form.simplification * settings.simplification_spacings * roof.spacing_m
     return unite_close_vertices(simplify_partition(partition, tolerance, outline_too=False), form.unite_mm)
 

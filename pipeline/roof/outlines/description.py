@@ -177,7 +177,7 @@ def least_description(
                 if total >= best[j, state] or abs(along) < _LEAST_PROGRESS * w:
                     continue
                 last = through[i, state]
-                if i > 0 and (state == free or last == free):
+                if i > 0 and free in (state, last):
                     turn = angle - angles[i, last]
                     total += _turn_price(math.cos(turn), math.sin(turn), prices)
                     if total >= best[j, state]:

@@ -22,7 +22,7 @@ from pipeline.compiler import kernel
 from pipeline.model import FloatArray, IntArray
 from pipeline.roof.edge_position import EdgePoints, mixed_pulse_reach_mm, outward_shift_mm
 from pipeline.roof.footprint import polygons_of
-from pipeline.roof.lines import Point, Run, corners, crossing, fitted_run, projected
+from pipeline.roof.lines import Run, corners, crossing, fitted_run, projected
 from pipeline.roof.outlines.description import FREE, Prices, least_description
 from pipeline.roof.outlines.few_points import are_few, directions, envelope_mm, likeliest
 from pipeline.roof.roof_settings import RoofSettings
@@ -36,8 +36,6 @@ _SYSTEM = 8.0
 """The price of a pair of common directions, square to one another, nats."""
 _SYSTEMS = 3
 """Most such pairs."""
-_NOISE_SPACINGS, _NOISE_M = 0.4, 0.25
-"""Standard deviation of the raw outline about the edge: in point spacings, and at least."""
 _BREAK_SPACINGS = 0.45
 """Edges end at vertices that are this far apart at least."""
 _FACTORS = (1.0, 0.6, 0.35)
@@ -56,8 +54,8 @@ _TRIED = 5
 """Most directions that are tried."""
 _LEAST_SPACINGS, _LEAST_M = 0.75, 0.3
 """Shorter edges are left out: in point spacings, and at least."""
-_MOVED = 0.4
-"""Most area between the raw outline and the edges: this part of the tolerance times the outline's length."""
+_MOVED = 1.2
+"""Most area between the raw outline and the edges: this many standard deviations of it times its length."""
 _SAME = math.cos(math.radians(3.0))
 _QUARTER = 0.5 * math.pi
 
@@ -115,38 +113,38 @@ def _straight_rings(
     """The rings of one part with straight edges; a ring that cannot be drawn so stays raw."""
     borders = _rings(polygon)
     drawn: list[FloatArray | None] = [None] * len(borders)
-    tolerance = max(settings.eave_tolerance_spacings * spacing_m, settings.min_eave_tolerance_m) * 1e3
+    noise_mm = max(settings.outline_noise_spacings * spacing_m, settings.min_outline_noise_m) * 1e3
     if points is not None and are_few(len(points.xy_mm), spacing_m):
-        drawn[0] = _of_few_points(borders[0], spacing_m, points, tolerance)
+        drawn[0] = _of_few_points(borders[0], spacing_m, points, noise_mm)
     for factor in _FACTORS:
-        noise_mm = factor * max(_NOISE_SPACINGS * spacing_m, _NOISE_M) * 1e3
         rings = [_with_breaks(border, _BREAK_SPACINGS * spacing_m * 1e3) for border in borders]
-        for k, (border, runs) in enumerate(described(rings, spacing_m * 1e3, noise_mm)):
+        for k, (border, runs) in enumerate(described(rings, spacing_m * 1e3, factor * noise_mm)):
             if drawn[k] is None and len(runs) > 2:
                 least = max(_LEAST_SPACINGS * spacing_m, _LEAST_M) * 1e3
-                drawn[k] = _ring_of(border, runs, least, tolerance)
+                drawn[k] = _ring_of(border, runs, least, noise_mm)
                 if drawn[k] is not None and points is not None:
                     _take_positions(border, runs, points, reach_mm)
-                    moved = _ring_of(border, runs, least, tolerance + 2.5 * points.spacing_mm)
+                    moved = _ring_of(border, runs, least, noise_mm + points.spacing_mm)
                     drawn[k] = drawn[k] if moved is None else moved
         if all(ring is not None for ring in drawn):
             break
     return [raw if ring is None else ring for raw, ring in zip(borders, drawn, strict=True)]
 
 
-def _of_few_points(border: FloatArray, spacing_m: float, points: EdgePoints, tolerance: float) -> FloatArray | None:
+def _of_few_points(border: FloatArray, spacing_m: float, points: EdgePoints, noise_mm: float) -> FloatArray | None:
     """The likeliest ring around few points: as described, or in two directions of any."""
     xy_mm = points.xy_mm.astype(np.float64)
     near = shapely.contains_xy(shapely.buffer(Polygon(border), 1e3 * spacing_m), xy_mm)
     xy_mm = xy_mm[near]
-    noise_mm = max(_NOISE_SPACINGS * spacing_m, _NOISE_M) * 1e3
     ring = _with_breaks(border, _BREAK_SPACINGS * spacing_m * 1e3)
     area_mm2 = Polygon(border).area
     ((own_border, own),) = described([ring], 1e3 * spacing_m, noise_mm)
     per_mm = 0.5 / (1e3 * spacing_m * noise_mm * noise_mm)
     ways = [(own_border, own)]
-    for angle in directions().tolist():
-        ways.append((border, _runs(ring, pairs_of([angle]), per_mm, PRICES._replace(free=PRICES.sharp))[0]))
+    ways += [
+        (border, _runs(ring, pairs_of([angle]), per_mm, PRICES._replace(free=PRICES.sharp))[0])
+        for angle in directions().tolist()
+    ]
     drawings: list[tuple[float, FloatArray]] = []
     least = max(_LEAST_SPACINGS * spacing_m, _LEAST_M) * 1e3
     for along, runs in ways:
@@ -154,7 +152,7 @@ def _of_few_points(border: FloatArray, spacing_m: float, points: EdgePoints, tol
             shift = envelope_mm(run, xy_mm, area_mm2, 1.5e3 * spacing_m)
             run.x += shift * math.sin(run.direction)
             run.y -= shift * math.cos(run.direction)
-        found = _ring_of(along, runs, least, 4.0 * tolerance) if len(runs) >= _FEWEST else None
+        found = _ring_of(along, runs, least, 4.0 * noise_mm) if len(runs) >= _FEWEST else None
         if found is not None:
             free = sum(not run.exact for run in runs)
             cost = PRICES.edge * len(found) + PRICES.free * free
@@ -297,9 +295,7 @@ def _begun_at_a_corner(ring: _Ring, runs: Sequence[Run]) -> _Ring:
     if len(runs) < 3:
         return ring
     # where the ring begins now there is an end of an edge, but perhaps no corner
-    clear = [
-        abs(math.sin(b.direction - a.direction)) * min(a.length, b.length) for a, b in itertools.pairwise(runs)
-    ]
+    clear = [abs(math.sin(b.direction - a.direction)) * min(a.length, b.length) for a, b in itertools.pairwise(runs)]
     first = runs[1 + max(range(len(clear)), key=clear.__getitem__)].first % len(ring.border)
     n = len(ring.border)
     turned = np.sort((ring.breaks[:-1] - first) % n)
@@ -379,7 +375,7 @@ def _turned(ring: FloatArray, is_hole: bool) -> FloatArray:
     return np.concatenate((turned[start:], turned[:start]))
 
 
-def _ring_of(border: FloatArray, runs: Sequence[Run], least_mm: float, tolerance: float) -> FloatArray | None:
+def _ring_of(border: FloatArray, runs: Sequence[Run], least_mm: float, noise_mm: float) -> FloatArray | None:
     """A sound ring through the corners of edges, if it lies near the raw one; small loops at corners are cut off."""
     copies = [dataclasses.replace(run) for run in runs]
     places = corners(border, without_short(border, copies, least_mm), math.inf, closed=True)
@@ -392,4 +388,4 @@ def _ring_of(border: FloatArray, runs: Sequence[Run], least_mm: float, tolerance
         if not parts:
             return None
         drawn = shapely.get_coordinates(max(parts, key=lambda part: part.area).exterior)[:-1]
-    return None if differ_by_more(drawn, border, _MOVED * tolerance * Polygon(border).length) else drawn
+    return None if differ_by_more(drawn, border, _MOVED * noise_mm * Polygon(border).length) else drawn

@@ -8,7 +8,7 @@ distance is worth, and edges what they cost in a description.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable
 
 import numpy as np
 import shapely
@@ -57,9 +57,7 @@ def envelope_mm(run: Run, xy_mm: FloatArray, area_mm2: float, out_mm: float) -> 
     return float(beside[np.argmin(a_mm * beside + outside)]) + min(1.0 / a_mm, 0.5 * out_mm)
 
 
-def likeliest(
-    drawings: Iterable[tuple[float, FloatArray]], xy_mm: FloatArray, spacing_m: float
-) -> FloatArray | None:
+def likeliest(drawings: Iterable[tuple[float, FloatArray]], xy_mm: FloatArray, spacing_m: float) -> FloatArray | None:
     """The ring of least cost among some with the cost of their edges; points (n, 2); None where there are none."""
     best, least = None, math.inf
     places = shapely.points(xy_mm)

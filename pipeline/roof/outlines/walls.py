@@ -22,7 +22,7 @@ from pipeline.model import FloatArray, IntArray, LabelArray
 from pipeline.roof.footprint import polygons_of
 from pipeline.roof.lines import Run, corners, fitted_run
 from pipeline.roof.outlines.description import Prices
-from pipeline.roof.outlines.exterior import breaks_of, described_chain, pairs_of, peaks_of
+from pipeline.roof.outlines.exterior import described_chain, pairs_of, peaks_of
 from pipeline.roof.partition import RoofPartition
 
 PRICES = Prices(edge=6.0, free=14.0, change=4.0, sharp=60.0, flat=60.0)
@@ -74,9 +74,7 @@ def divided(
     walls = []
     for border in _through(_borders(units, shapely.buffer(outline_mm, beyond))):
         near = edges[shapely.distance(LineString(border), shapely.linestrings(edges.reshape(-1, 2, 2))) <= _NEARBY_MM]
-        runs = described_chain(
-            border, pairs_of(peaks_of(_edge_runs(near))), spacing_mm, _noise_mm(spacing_m), PRICES
-        )
+        runs = described_chain(border, pairs_of(peaks_of(_edge_runs(near))), spacing_mm, _noise_mm(spacing_m), PRICES)
         walls.append(_Wall(border, runs))
     _put_in_line(walls, edges, max(_IN_LINE_MM, spacing_mm))
     lines = [_drawn(wall, beyond) for wall in walls]
@@ -128,7 +126,9 @@ def _borders(units: RoofPartition, within: Polygon | MultiPolygon) -> list[Float
     """The borders between two units, (n, 2) each, as far as they lie within an area."""
     numbers = sorted(set(units.labels.tolist()))
     whole = [
-        shapely.coverage_union_all([p for p, label in zip(units.polygons, units.labels.tolist(), strict=True) if label == k])
+        shapely.coverage_union_all(
+            [p for p, label in zip(units.polygons, units.labels.tolist(), strict=True) if label == k]
+        )
         for k in numbers
     ]
     lines = shapely.boundary(np.array(whole, dtype=object))
@@ -158,9 +158,7 @@ def _through(borders: Sequence[FloatArray]) -> list[FloatArray]:
     follows: dict[tuple[int, bool], tuple[int, bool]] = {}
     for meeting in ends.values():
         ways = {end: _way_from(borders[end[0]], end[1]) for end in meeting}
-        pairs = [
-            (float(ways[a] @ ways[b]), a, b) for a, b in itertools.combinations(meeting, 2) if a[0] != b[0]
-        ]
+        pairs = [(float(ways[a] @ ways[b]), a, b) for a, b in itertools.combinations(meeting, 2) if a[0] != b[0]]
         straightest = min(pairs, default=None)
         if straightest is not None and straightest[0] < -0.8:
             _, a, b = straightest

@@ -43,7 +43,7 @@ def zigzag(amplitude_mm: float, seed: int = 0) -> list[tuple[float, float]]:
 
 
 def test_a_zigzag_step_becomes_one_line_square_to_the_outline() -> None:
-    straight = straighten_borders(two_faces(zigzag(250.0)), [plane(0, 0, 9.0), plane(0, 0, 5.0)], 0.5, SETTINGS)
+    straight = straighten_borders(two_faces(zigzag(250.0)), [plane(0, 0, 9.0), plane(0, 0, 5.0)], 0.5)
     assert is_coverage(straight)
     for polygon in straight.polygons:
         assert shapely.get_num_coordinates(polygon) == 5
@@ -55,7 +55,7 @@ def test_a_zigzag_step_becomes_one_line_square_to_the_outline() -> None:
 
 def test_a_ridge_lies_exactly_where_the_planes_cross() -> None:
     planes = [plane(0.6, 0.1, 3.0), plane(-0.6, 0.1, 3.0 + 1.2 * 5.08)]
-    straight = straighten_borders(two_faces(zigzag(200.0)), planes, 0.5, SETTINGS)
+    straight = straighten_borders(two_faces(zigzag(200.0)), planes, 0.5)
     x = shapely.get_coordinates(straight.polygons[0])[:, 0]
     assert set(x[x > 0].tolist()) == {5080.0}
 
@@ -66,7 +66,7 @@ def test_a_step_with_a_corner_keeps_it() -> None:
     across = [(x, 5000 + rng.uniform(-150, 150)) for x in np.arange(4250, 7000, 250)]
     upper = [(7000 + rng.uniform(-150, 150), y) for y in np.arange(5000, WIDTH_MM + 1, 250)]
     border = [(float(round(x)), float(round(y))) for x, y in (*lower, *across, *upper)]
-    straight = straighten_borders(two_faces(border), [plane(0, 0, 9.0), plane(0, 0, 5.0)], 0.5, SETTINGS)
+    straight = straighten_borders(two_faces(border), [plane(0, 0, 9.0), plane(0, 0, 5.0)], 0.5)
     assert is_coverage(straight)
     assert shapely.get_num_coordinates(straight.polygons[0]) == 7
     assert straight.polygons[0].area == pytest.approx(55e6, rel=0.01)
@@ -83,9 +83,9 @@ def test_three_planes_of_a_hip_meet_in_one_point(exact_roof: ExactRoofs) -> None
 
 def test_the_outline_stays(exact_roof: ExactRoofs) -> None:
     roof = exact_roof("dormer", noise_m=0.03, with_footprint=True, turn_deg=20.0)
-    plan, points, roof_settings = roof.partition()
+    plan, points, _ = roof.partition()
     clipped = clip_partition(plan.faces, plan.outline_mm, 1.0)
-    straight = straighten_borders(clipped, plan.planes, points.spacing_m, roof_settings)
+    straight = straighten_borders(clipped, plan.planes, points.spacing_m)
     assert is_coverage(straight)
     before, after = (shapely.union_all(list(p.polygons)) for p in (clipped, straight))
     assert shapely.symmetric_difference(before, after).area < 2.0 * before.length
@@ -108,7 +108,7 @@ def test_any_partition_stays_a_coverage_with_the_same_faces(seed: int) -> None:
     if not is_coverage(partition):
         return  # points a few millimetres apart, cut and rounded
     planes = [plane(*row) for row in coefficients.tolist()]
-    straight = straighten_borders(partition, planes, float(rng.uniform(0.2, 1.5)), SETTINGS)
+    straight = straighten_borders(partition, planes, float(rng.uniform(0.2, 1.5)))
     assert straight.labels.tolist() == partition.labels.tolist()
     assert is_coverage(straight)
     xy_after = shapely.get_coordinates(list(straight.polygons))

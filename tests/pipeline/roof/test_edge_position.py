@@ -11,9 +11,9 @@ from candidates_by_hand import turned_plan
 from shapely import MultiPolygon, Polygon
 
 from pipeline.model import BoolArray, FloatArray, IntArray
-from pipeline.roof.eaves import straighten
 from pipeline.roof.edge_position import EdgePoints, mixed_pulse_reach_mm, outward_shift_mm
 from pipeline.roof.lines import Run
+from pipeline.roof.outlines.exterior import straighten
 from pipeline.roof.roof_settings import RoofSettings
 
 LENGTH_M, DEPTH_M = 14.0, 9.0
