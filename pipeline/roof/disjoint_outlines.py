@@ -27,8 +27,8 @@ _ACUTE_COS = 0.7
 """An inner angle is acute where its cosine is larger: 45 degrees."""
 _SHORT_MM = 700.0
 """Edges below this are short."""
-_ACUTE_COST, _SHORT_COST, _PART_COST = 3.0, 1.0, 4.0
-"""Costs of what a division leaves, in corners; a point on the wrong side costs one corner, too."""
+_ACUTE_COST, _SHORT_COST, _PART_COST, _WRONG_COST = 3.0, 1.0, 4.0, 2.0
+"""Costs of what a division leaves, in corners, and of a point on the wrong side."""
 _KEPT_SHARE = 0.4
 """A candidate that would keep less of its outline keeps the piece instead, if the other can spare it."""
 _BARRED = 1e6
@@ -87,7 +87,7 @@ def _shares(piece: Polygon, first: Claim, second: Claim) -> tuple[list[Polygon],
         options.extend(_chords(piece, own, other))
     costs = []
     for mine, theirs, wrong in options:
-        cost = float(wrong)
+        cost = _WRONG_COST * wrong
         for claim, lost in ((first, theirs), (second, mine)):
             left = shapely.difference(claim.outline_mm, MultiPolygon(lost), grid_size=1.0) if lost else claim.outline_mm
             cost += _effort(left) + (_BARRED if left.area < _KEPT_SHARE * claim.outline_mm.area else 0.0)
