@@ -30,7 +30,7 @@ from pipeline.model import (
 from pipeline.registry import extra
 from pipeline.roof.arrangement.arranging import arrange
 from pipeline.roof.arrangement.guide_lines import NO_GUIDES, Guides
-from pipeline.roof.eaves import straighten
+from pipeline.roof.outlines.exterior import straighten
 from pipeline.roof.edge_position import EdgePoints, mixed_pulse_reach_mm
 from pipeline.roof.footprint import outline
 from pipeline.roof.labelling import continue_crossings, empty_samples, fill_labels

@@ -16,10 +16,9 @@ from shapely import MultiPolygon
 from pipeline.errors import BuildingError
 from pipeline.model import Candidate, LabelArray, Plane
 from pipeline.prepared_cloud import prepare_cloud
-from pipeline.roof.footprint import polygons_of
+from pipeline.roof.outlines.walls import divided
 from pipeline.roof.plan import partition_roof, roof_points
 from pipeline.roof.roof_settings import RoofSettings
-from pipeline.roof.traced_forms import FORMS, draw_clipped
 
 
 def unit_outlines(candidate: Candidate, units: LabelArray, settings: RoofSettings) -> list[MultiPolygon | None]:
@@ -33,13 +32,10 @@ def unit_outlines(candidate: Candidate, units: LabelArray, settings: RoofSetting
         bare = roof_points(prepare_cloud(candidate, settings.max_points), settings)
         roof = dataclasses.replace(bare, labels=np.ascontiguousarray(units[bare.index], np.int32))
         plan = partition_roof(roof, _levels(candidate, units, count), settings)
-        partition = draw_clipped(plan, roof, settings, FORMS[0])
+        parts = divided(plan.faces, plan.outline_mm, roof.xy_mm, roof.labels, roof.spacing_m)
     except (BuildingError, shapely.errors.GEOSException):
         return [None] * count
-    parts: list[list[shapely.Polygon]] = [[] for _ in range(count)]
-    for polygon, unit in zip(partition.polygons, partition.labels.tolist(), strict=True):
-        parts[unit].append(polygon)
-    return [_united(polygons) for polygons in parts]
+    return [_in_metres(parts[unit]) if unit in parts else None for unit in range(count)]
 
 
 def _levels(candidate: Candidate, units: LabelArray, count: int) -> list[Plane]:
@@ -51,9 +47,6 @@ def _levels(candidate: Candidate, units: LabelArray, count: int) -> list[Plane]:
     return levels
 
 
-def _united(polygons: list[shapely.Polygon]) -> MultiPolygon | None:
-    """The parts of one unit in metres; None where there are none."""
-    if not polygons:
-        return None
-    whole = polygons_of(shapely.union_all(polygons, grid_size=1.0))
-    return shapely.transform(MultiPolygon(whole), lambda xy: xy * 1e-3) if whole else None
+def _in_metres(shape_mm: MultiPolygon) -> MultiPolygon:
+    drawn: MultiPolygon = shapely.transform(shape_mm, lambda xy: xy * 1e-3)
+    return drawn

@@ -1,0 +1,315 @@
+"""The outline around roof points: the polygon that explains the edge of the points with the shortest description.
+
+The raw outline zigzags between outermost roof points. Its shortest description (`description.py`) has few edges, in few
+directions: those that the outline itself shows, each with the one square to it, are taken one by one while the
+description gets shorter. Each edge is then moved to where the points along it put the edge of the roof; corners are
+where edges meet.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import shapely
+from shapely import MultiPolygon, Polygon
+from shapely.geometry.polygon import orient
+
+from pipeline.compiler import kernel
+from pipeline.model import FloatArray, IntArray
+from pipeline.roof.edge_position import EdgePoints, mixed_pulse_reach_mm, outward_shift_mm
+from pipeline.roof.footprint import polygons_of
+from pipeline.roof.lines import Point, Run, corners, fitted_run
+from pipeline.roof.outlines.description import FREE, Prices, least_description
+from pipeline.roof.roof_settings import RoofSettings
+from pipeline.roof.snapped_rings import differ_by_more, on_grid, snapped_ring
+
+PRICES = Prices(edge=3.0, free=7.0, change=3.0, jog=9.0, sharp=60.0, flat=60.0)
+"""What is saved must be worth it: at these prices a step of a wall is drawn that is as deep as the points show well."""
+_FREE_ALONE = 1.0
+"""The price of a direction of its own while no common direction is known."""
+_SYSTEM = 8.0
+"""The price of a pair of common directions, square to one another, nats."""
+_SYSTEMS = 3
+"""Most such pairs."""
+_NOISE_SPACINGS, _NOISE_M = 0.3, 0.2
+"""Standard deviation of the raw outline about the edge: in point spacings, and at least."""
+_BREAK_SPACINGS = 0.45
+"""Edges end at vertices that are this far apart at least."""
+_FACTORS = (1.0, 0.6, 0.35)
+"""Times the noise: an outline that cannot be drawn with few edges is tried with more."""
+_APART = math.radians(8.0)
+"""Two pairs of common directions differ by more."""
+_ABOUT = math.radians(12.0)
+"""Edges that differ by less from a common direction make it more exact."""
+_PEAK = math.radians(2.5)
+"""How far directions of edges scatter about a common one."""
+_LEAST_PEAK = 0.05
+"""Least weight of a direction that is tried, as a share of that of the first."""
+_TRIED = 5
+"""Most directions that are tried."""
+_MOVED = 0.4
+"""Most area between the raw outline and the edges: this part of the tolerance times the outline's length."""
+_QUARTER = 0.5 * math.pi
+
+
+@dataclasses.dataclass(frozen=True)
+class _Ring:
+    """A ring of the raw outline."""
+
+    border: FloatArray
+    """(n, 2) its vertices, millimetres, the roof on the left."""
+    breaks: IntArray
+    """(m,) where edges may end; the last is the first again, behind n."""
+
+
+def straighten(
+    outline_mm: MultiPolygon, spacing_m: float, settings: RoofSettings, points: EdgePoints | None = None
+) -> MultiPolygon:
+    """Draw an outline with straight edges, valid in integer millimetres; a ring that moves too much area stays raw.
+
+    With the roof points every edge that is long enough moves to where they show it, and the outline is drawn back by
+    what mixed pulses add; without them edges stay amid the raw zigzag.
+    """
+    reach_mm = 0.0 if points is None else mixed_pulse_reach_mm(outline_mm, points)
+    raw = _drawn_back(outline_mm, reach_mm)
+    straightened: list[Polygon] = []
+    for part in raw:
+        outer, *holes = _straight_rings(part, spacing_m, settings, points, reach_mm)
+        drawn = Polygon(outer, holes)
+        if not drawn.is_valid:
+            # a hole that crosses the outside cuts into it
+            cut = shapely.difference(
+                Polygon(outer), shapely.union_all([Polygon(hole) for hole in holes]), grid_size=1.0
+            )
+            drawn = max(polygons_of(cut), key=lambda piece: piece.area, default=orient(part))
+        straightened.append(drawn)
+    result = MultiPolygon(straightened)
+    if not result.is_valid:
+        result = MultiPolygon(polygons_of(shapely.union_all(straightened, grid_size=1.0)))
+    return result if result.is_valid and not result.is_empty else MultiPolygon(raw)
+
+
+def _drawn_back(outline_mm: MultiPolygon, reach_mm: float) -> list[Polygon]:
+    """Every part smaller by a distance all around; one that would vanish or fall apart stays."""
+    parts: list[Polygon] = list(outline_mm.geoms)
+    if reach_mm <= 0.0:
+        return parts
+    smaller = [polygons_of(on_grid(shapely.buffer(part, -reach_mm, join_style="mitre"))) for part in parts]
+    drawn = [pieces[0] if len(pieces) == 1 else part for pieces, part in zip(smaller, parts, strict=True)]
+    return drawn if len(drawn) == 1 or MultiPolygon(drawn).is_valid else parts
+
+
+def _straight_rings(
+    polygon: Polygon, spacing_m: float, settings: RoofSettings, points: EdgePoints | None, reach_mm: float
+) -> list[FloatArray]:
+    """The rings of one part with straight edges; a ring that cannot be drawn so stays raw."""
+    borders = _rings(polygon)
+    drawn: list[FloatArray | None] = [None] * len(borders)
+    tolerance = max(settings.eave_tolerance_spacings * spacing_m, settings.min_eave_tolerance_m) * 1e3
+    for factor in _FACTORS:
+        noise_mm = factor * max(_NOISE_SPACINGS * spacing_m, _NOISE_M) * 1e3
+        rings = [_with_breaks(border, _BREAK_SPACINGS * spacing_m * 1e3) for border in borders]
+        for k, (border, runs) in enumerate(described(rings, spacing_m * 1e3, noise_mm)):
+            if drawn[k] is None and len(runs) > 2:
+                if points is not None:
+                    _take_positions(border, runs, points, reach_mm)
+                drawn[k] = _accepted(border, corners(border, runs, 1.5 * tolerance, closed=True), factor * tolerance)
+        if all(ring is not None for ring in drawn):
+            break
+    return [raw if ring is None else ring for raw, ring in zip(borders, drawn, strict=True)]
+
+
+def described(rings: Sequence[_Ring], spacing_mm: float, noise_mm: float) -> list[tuple[FloatArray, list[Run]]]:
+    """The edges of some rings, which share their directions: those of the shortest description of all of them.
+
+    With the vertices of each ring, which begins anew at a corner.
+    """
+    per_mm = 0.5 / (spacing_mm * noise_mm * noise_mm)
+    alone = PRICES._replace(free=_FREE_ALONE)
+    none = np.empty(0)
+    runs = [_runs(ring, none, per_mm, alone)[0] for ring in rings]
+    rings = [_begun_at_a_corner(ring, own) for ring, own in zip(rings, runs, strict=True)]
+    found = [_runs(ring, none, per_mm, alone) for ring in rings]
+    least, best = math.fsum(cost for _, cost in found), [own for own, _ in found]
+    tried = peaks_of([run for own in best for run in own])
+    systems: list[float] = []
+    while len(systems) < _SYSTEMS:
+        better: tuple[float, list[float], list[list[Run]]] | None = None
+        for angle in tried:
+            if any(abs(off_square(angle, system)) < _APART for system in systems):
+                continue
+            more = [*systems, angle]
+            for _ in range(2):
+                found = [_runs(ring, pairs_of(more), per_mm, PRICES) for ring in rings]
+                cost = math.fsum(own_cost for _, own_cost in found) + _SYSTEM * len(more)
+                if better is None or cost < better[0]:
+                    better = cost, more, [own for own, _ in found]
+                more = _more_exact(more, [(ring, own) for ring, (own, _) in zip(rings, found, strict=True)])
+        if better is None or better[0] >= least:
+            break
+        least, systems, best = better
+    return [(ring.border, own) for ring, own in zip(rings, best, strict=True)]
+
+
+def _runs(ring: _Ring, directions: FloatArray, per_mm: float, prices: Prices) -> tuple[list[Run], float]:
+    """The edges of a ring, and the length of their description."""
+    ends, of_edge, angles, cost = least_description(ring.border, ring.breaks, directions, per_mm, prices)
+    runs = []
+    for k, (index, angle) in enumerate(zip(of_edge.tolist(), angles.tolist(), strict=True)):
+        run = fitted_run(ring.border, int(ring.breaks[ends[k]]), int(ring.breaks[ends[k + 1]]))
+        run.direction, run.exact = angle, index != FREE
+        runs.append(run)
+    return runs, cost
+
+
+def described_chain(
+    border: FloatArray, directions: FloatArray, spacing_mm: float, noise_mm: float, prices: Prices
+) -> list[Run]:
+    """The edges of an open border (n, 2), of which `directions` are common to others."""
+    step = _BREAK_SPACINGS * spacing_mm
+    breaks = breaks_of(border, step)[:-1]
+    breaks = np.append(breaks[:-1] if len(breaks) > 1 else breaks, len(border) - 1)
+    per_mm = 0.5 / (spacing_mm * noise_mm * noise_mm)
+    return _runs(_Ring(border=border, breaks=breaks), directions, per_mm, prices)[0]
+
+
+def pairs_of(systems: Sequence[float]) -> FloatArray:
+    """Every direction, and the one square to it."""
+    return np.array([angle + turn for angle in systems for turn in (0.0, _QUARTER)])
+
+
+def off_square(direction: float, dominant: float) -> float:
+    """By how much a direction differs from the nearest one along or square to another, radians."""
+    return math.remainder(direction - dominant, _QUARTER)
+
+
+def peaks_of(runs: Sequence[Run]) -> list[float]:
+    """Directions, modulo a right angle, that most of the squared length of some edges has, the first with most."""
+    left = [(run.direction, run.length**2) for run in runs]
+    whole = math.fsum(weight for _, weight in left)
+    found: list[float] = []
+    first = 0.0
+    while left and len(found) < _TRIED and whole > 0.0:
+        votes = [
+            math.fsum(weight * math.exp(-0.5 * (off_square(other, angle) / _PEAK) ** 2) for other, weight in left)
+            for angle, _ in left
+        ]
+        best = max(range(len(left)), key=votes.__getitem__)
+        first = first or votes[best]
+        if votes[best] < _LEAST_PEAK * first:
+            break
+        about = left[best][0]
+        near = [(off_square(other, about), weight) for other, weight in left if abs(off_square(other, about)) < _APART]
+        share = [(off, weight * math.exp(-0.5 * (off / _PEAK) ** 2)) for off, weight in near]
+        found.append(about + math.fsum(off * w for off, w in share) / math.fsum(w for _, w in share))
+        left = [(other, weight) for other, weight in left if abs(off_square(other, about)) >= _APART]
+    return found
+
+
+def _more_exact(systems: Sequence[float], drawn: Sequence[tuple[_Ring, list[Run]]]) -> list[float]:
+    """The directions as the borders along their edges have them, on average."""
+    offs: list[list[tuple[float, float]]] = [[] for _ in systems]
+    for ring, runs in drawn:
+        for run in runs:
+            if not run.exact:
+                continue
+            own = fitted_run(ring.border, run.first, run.last).direction
+            k = min(range(len(systems)), key=lambda k: abs(off_square(run.direction, systems[k])))
+            off = off_square(own, systems[k])
+            if abs(off) < _ABOUT:
+                offs[k].append((off, run.length**3))
+    return [
+        system + (math.fsum(off * w for off, w in of) / math.fsum(w for _, w in of) if of else 0.0)
+        for system, of in zip(systems, offs, strict=True)
+    ]
+
+
+def _with_breaks(border: FloatArray, step_mm: float) -> _Ring:
+    """A ring with breaks at vertices that lie a step or more apart."""
+    return _Ring(border=border, breaks=breaks_of(border, step_mm))
+
+
+@kernel
+def breaks_of(border: FloatArray, step: float) -> IntArray:
+    """Numbers of vertices of a ring (n, 2), ascending from 0 to n, each a step or more from the one before."""
+    n = len(border)
+    breaks = np.empty(n + 1, np.int64)
+    breaks[0], count = 0, 1
+    for k in range(1, n):
+        dx, dy = border[k, 0] - border[breaks[count - 1], 0], border[k, 1] - border[breaks[count - 1], 1]
+        if dx * dx + dy * dy >= step * step:
+            breaks[count] = k
+            count += 1
+    breaks[count] = n
+    return breaks[: count + 1].copy()
+
+
+def _begun_at_a_corner(ring: _Ring, runs: Sequence[Run]) -> _Ring:
+    """The same ring from its clearest corner on: where a description begins, it has a corner."""
+    if len(runs) < 3:
+        return ring
+    clear = [
+        abs(math.sin(b.direction - a.direction)) * min(a.length, b.length)
+        for a, b in zip((runs[-1], *runs[:-1]), runs, strict=True)
+    ]
+    first = runs[max(range(len(runs)), key=clear.__getitem__)].first % len(ring.border)
+    n = len(ring.border)
+    turned = np.sort((ring.breaks[:-1] - first) % n)
+    return _Ring(border=np.concatenate((ring.border[first:], ring.border[:first])), breaks=np.append(turned, n))
+
+
+def _take_positions(border: FloatArray, runs: Sequence[Run], points: EdgePoints, reach_mm: float) -> None:
+    """Move edges to where the points along them put them; one that is too short moves as the others do on average."""
+    shifts = [outward_shift_mm(border, run, points, reach_mm) for run in runs]
+    known = sorted(shift for shift in shifts if shift is not None)
+    usual = known[len(known) // 2] if known else 0.0
+    for run, own in zip(runs, shifts, strict=True):
+        shift = min(max(usual if own is None else own, -points.spacing_mm), points.spacing_mm)
+        run.x += shift * math.sin(run.direction)
+        run.y -= shift * math.cos(run.direction)
+
+
+def _rings(polygon: Polygon) -> list[FloatArray]:
+    """Vertices of the rings, the first not repeated, each starting at its vertex farthest from the centroid.
+
+    The roof is on the left of all of them.
+    """
+    lines = (polygon.exterior, *polygon.interiors)
+    return [_turned(shapely.get_coordinates(line)[:-1], k > 0) for k, line in enumerate(lines)]
+
+
+@kernel
+def _turned(ring: FloatArray, is_hole: bool) -> FloatArray:
+    """A ring (n, 2) that turns left, or right as a hole, and starts at the vertex farthest from their centroid."""
+    n = len(ring)
+    twice_area, mean_x, mean_y = 0.0, 0.0, 0.0
+    for k in range(n):
+        following = (k + 1) % n
+        twice_area += ring[k, 0] * ring[following, 1] - ring[following, 0] * ring[k, 1]
+        mean_x, mean_y = mean_x + ring[k, 0], mean_y + ring[k, 1]
+    mean_x, mean_y = mean_x / n, mean_y / n
+    start, farthest = 0, -1.0
+    turned = ring.copy() if (twice_area >= 0.0) != is_hole else np.concatenate((ring[:1], ring[:0:-1]))
+    for k in range(n):
+        x, y = turned[k, 0] - mean_x, turned[k, 1] - mean_y
+        away = np.rint(x * x + y * y)
+        if away > farthest:
+            start, farthest = k, away
+    return np.concatenate((turned[start:], turned[:start]))
+
+
+def _accepted(ring: FloatArray, places: Sequence[Point], tolerance: float) -> FloatArray | None:
+    """The corners as a ring where they make a sound one near the raw ring; small loops at corners are cut off."""
+    if len(places) < 3:
+        return None
+    drawn = snapped_ring(np.array(places))
+    if len(drawn) == 0:
+        sound = shapely.make_valid(Polygon(places), method="structure", keep_collapsed=False)
+        parts = [part for polygon in polygons_of(sound) for part in polygons_of(shapely.set_precision(polygon, 1.0))]
+        if not parts:
+            return None
+        drawn = shapely.get_coordinates(max(parts, key=lambda part: part.area).exterior)[:-1]
+    return None if differ_by_more(drawn, ring, _MOVED * tolerance * Polygon(ring).length) else drawn
