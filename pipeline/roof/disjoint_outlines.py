@@ -166,7 +166,10 @@ def left_of(
     if lost:
         own = [part for polygon in own for part in _without_needles(polygon)] or own
     large = [polygon for polygon in own if polygon.area >= min_area_m2 * 1e6]
-    return MultiPolygon(large or sorted(own, key=lambda polygon: -polygon.area)[:1]) if own else outline_mm
+    if not own:
+        return outline_mm
+    # the order of the pieces decides where rings begin
+    return shapely.normalize(MultiPolygon(large or [max(own, key=lambda polygon: (polygon.area, polygon.bounds))]))
 
 
 def _without_needles(polygon: Polygon) -> list[Polygon]:
