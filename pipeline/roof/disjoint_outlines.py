@@ -15,7 +15,7 @@ import numpy as np
 import shapely
 from shapely import MultiPolygon, Polygon
 
-from pipeline.model import IntArray
+from pipeline.model import FloatArray, IntArray
 from pipeline.roof.footprint import polygons_of
 
 # None of these is a setting: they choose between ways to divide an area that is narrower than a few point spacings.
@@ -39,6 +39,8 @@ _DIRECTIONS = 3
 """Longest edges of an overlap that give a chord its direction."""
 _NEEDLE_MM = 120.0
 """Half the width of a part that is not left of an outline: no wing of a house is as narrow."""
+_SHORTEST_MM = 20.0
+"""Corners nearer to each other are united when a solid is made, which would move a common border."""
 _MITRE = 6.0
 """Offset corners sharper than 20 degrees are cut."""
 
@@ -150,8 +152,8 @@ def left_of(
 ) -> MultiPolygon:
     """An outline without the parts of its overlaps that it lost; those that it kept give it their corners.
 
-    Needles are cut off, and parts below the least area left out, except the largest. Nothing is added. An outline that
-    others took whole is returned as it is.
+    Needles are cut off, and parts below the least area left out, except the largest. Nothing is added beyond the rounding
+    of common corners to 1 mm. An outline that others took whole is returned as it is.
     """
     pieces = [*kept, *lost]
     if not pieces:
@@ -165,6 +167,7 @@ def left_of(
     own = polygons_of(shapely.coverage_union_all(cells[is_own]))
     if lost:
         own = [part for polygon in own for part in _without_needles(polygon)] or own
+    own = [_without_short_edges(polygon) for polygon in own]
     large = [polygon for polygon in own if polygon.area >= min_area_m2 * 1e6]
     if not own:
         return outline_mm
@@ -184,3 +187,22 @@ def _is_needle(part: Polygon) -> bool:
     """Whether a part that an opening removes is more than a film along an edge or a cut corner."""
     return part.area > 0.5 * _NEEDLE_MM * _NEEDLE_MM and 2.0 * part.area > 0.1 * _NEEDLE_MM * part.length
 
+
+def _without_short_edges(polygon: Polygon) -> Polygon:
+    """A polygon without edges that a solid cannot have: the corner at one end is cut off where that adds nothing."""
+    rings = [_thinned(shapely.get_coordinates(ring)[:-1]) for ring in shapely.get_rings(polygon.normalize()).tolist()]
+    thinned = Polygon(rings[0], rings[1:])
+    return thinned if thinned.is_valid else polygon
+
+
+def _thinned(ring: FloatArray) -> FloatArray:
+    """A ring (n, 2) with the area to its right, without the corners whose removal shortens it at a short edge."""
+    while len(ring) > 4:
+        into, out = ring - np.roll(ring, 1, axis=0), np.roll(ring, -1, axis=0) - ring
+        cut_off = into[:, 1] * out[:, 0] - into[:, 0] * out[:, 1]
+        short = np.hypot(out[:, 0], out[:, 1]) < _SHORTEST_MM
+        free = (short | np.roll(short, 1)) & (cut_off >= 0.0)
+        if not free.any():
+            break
+        ring = np.delete(ring, int(np.argmin(np.where(free, cut_off, np.inf))), axis=0)
+    return ring
