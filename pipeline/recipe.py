@@ -111,7 +111,7 @@ def _reconstruct(
             forms = traced_forms(plan, roof, settings.roof)
         model, codes = first_valid(
             (
-                NamedForm(form.name, partial(own_model, building, segmentation, roof, form), form.detail)
+                dataclasses.replace(form, draw=partial(own_model, building, segmentation, roof, form))
                 for form in forms
             ),
             building,

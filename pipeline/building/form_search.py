@@ -51,6 +51,8 @@ def first_valid(
             if waiting is not None:
                 decisions[at] = dataclasses.replace(decisions[at], outcome=Outcome.CHOSEN)
             return waiting, () if waiting is not None else tuple(sorted(codes))
+        if form.is_last_resort and waiting is not None:
+            continue
         try:
             model = form()
         except UNDRAWABLE as error:

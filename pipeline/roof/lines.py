@@ -18,7 +18,7 @@ from pipeline.model import FloatArray
 
 Point = tuple[float, float]
 
-_PARALLEL = math.sin(math.radians(20.0))
+_PARALLEL = math.sin(math.radians(8.0))
 """Lines that meet at a smaller angle have no certain corner: their noise moves it by several tolerances."""
 
 

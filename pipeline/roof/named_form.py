@@ -44,6 +44,8 @@ class NamedForm(Generic[Drawn_co]):
     draw: Callable[[], Drawn_co]
     detail: str = ""
     """How this one differs from others of its name."""
+    is_last_resort: bool = False
+    """Whether it is drawn only where no other is valid: its outline is that of the points, zigzag and all."""
 
     def __call__(self) -> Drawn_co:
         """Draw it."""

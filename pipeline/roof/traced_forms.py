@@ -73,7 +73,7 @@ def plan_forms(plan: RoofPlan, roof: RoofPoints, settings: RoofSettings) -> Iter
         for form in RAW_FORMS if clipped else (FORMS[0], *RAW_FORMS):
             tolerance = form.simplification * settings.simplification_spacings * roof.spacing_m
             raw = partial(simplify_partition, plan.raw, tolerance)
-            yield NamedForm(TRACED, raw, f"up to the raw outline, {form.words}")
+            yield NamedForm(TRACED, raw, f"up to the raw outline, {form.words}", is_last_resort=clipped)
 
 
 def draw_clipped(plan: RoofPlan, roof: RoofPoints, settings: RoofSettings, form: PlanForm) -> RoofPartition:

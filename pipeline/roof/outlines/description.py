@@ -31,8 +31,6 @@ class Prices(NamedTuple):
     """For an edge in a direction of its own."""
     change: float
     """Where two edges meet that are neither parallel nor square to one another."""
-    jog: float
-    """Where two parallel edges follow each other, joined by a step."""
     sharp: float
     """For an inner angle below 63 degrees."""
     flat: float
@@ -92,9 +90,7 @@ def _turns(directions: FloatArray, prices: Prices) -> FloatArray:
     turns = np.zeros((2 * d + 1, 2 * d + 1))
     for a in range(2 * d):
         for b in range(2 * d):
-            if a == b:
-                turns[a, b] = prices.jog
-            elif a // 2 == b // 2:
+            if a // 2 == b // 2:  # parallel edges are one, or have one between them
                 turns[a, b] = np.inf
             else:
                 angle = directions[b // 2] - directions[a // 2] + math.pi * ((b % 2) - (a % 2))
@@ -144,7 +140,7 @@ def least_description(
     live = np.empty(m, np.int64)
     live[0] = 0
     alive = 1
-    spare = prices.edge + prices.free + prices.change + prices.jog
+    spare = prices.edge + prices.free + prices.change
     for j in range(1, m):
         xj, yj = border[breaks[j] % n, 0], border[breaks[j] % n, 1]
         reached = np.full(alive, np.inf)

@@ -9,6 +9,7 @@ where edges meet.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Sequence
 
@@ -21,12 +22,12 @@ from pipeline.compiler import kernel
 from pipeline.model import FloatArray, IntArray
 from pipeline.roof.edge_position import EdgePoints, mixed_pulse_reach_mm, outward_shift_mm
 from pipeline.roof.footprint import polygons_of
-from pipeline.roof.lines import Point, Run, corners, fitted_run
+from pipeline.roof.lines import Point, Run, corners, crossing, fitted_run, projected
 from pipeline.roof.outlines.description import FREE, Prices, least_description
 from pipeline.roof.roof_settings import RoofSettings
 from pipeline.roof.snapped_rings import differ_by_more, on_grid, snapped_ring
 
-PRICES = Prices(edge=3.0, free=7.0, change=3.0, jog=9.0, sharp=60.0, flat=60.0)
+PRICES = Prices(edge=4.0, free=8.0, change=3.0, sharp=60.0, flat=60.0)
 """What is saved must be worth it: at these prices a step of a wall is drawn that is as deep as the points show well."""
 _FREE_ALONE = 1.0
 """The price of a direction of its own while no common direction is known."""
@@ -34,12 +35,14 @@ _SYSTEM = 8.0
 """The price of a pair of common directions, square to one another, nats."""
 _SYSTEMS = 3
 """Most such pairs."""
-_NOISE_SPACINGS, _NOISE_M = 0.3, 0.2
+_NOISE_SPACINGS, _NOISE_M = 0.4, 0.25
 """Standard deviation of the raw outline about the edge: in point spacings, and at least."""
 _BREAK_SPACINGS = 0.45
 """Edges end at vertices that are this far apart at least."""
 _FACTORS = (1.0, 0.6, 0.35)
 """Times the noise: an outline that cannot be drawn with few edges is tried with more."""
+_FEWEST, _FEW_BREAKS = 4, 60
+"""A ring of so few breaks has four edges at least."""
 _APART = math.radians(8.0)
 """Two pairs of common directions differ by more."""
 _ABOUT = math.radians(12.0)
@@ -50,8 +53,11 @@ _LEAST_PEAK = 0.05
 """Least weight of a direction that is tried, as a share of that of the first."""
 _TRIED = 5
 """Most directions that are tried."""
+_LEAST_SPACINGS, _LEAST_M = 0.75, 0.3
+"""Shorter edges are left out: in point spacings, and at least."""
 _MOVED = 0.4
 """Most area between the raw outline and the edges: this part of the tolerance times the outline's length."""
+_SAME = math.cos(math.radians(3.0))
 _QUARTER = 0.5 * math.pi
 
 
@@ -114,9 +120,12 @@ def _straight_rings(
         rings = [_with_breaks(border, _BREAK_SPACINGS * spacing_m * 1e3) for border in borders]
         for k, (border, runs) in enumerate(described(rings, spacing_m * 1e3, noise_mm)):
             if drawn[k] is None and len(runs) > 2:
-                if points is not None:
+                least = max(_LEAST_SPACINGS * spacing_m, _LEAST_M) * 1e3
+                drawn[k] = _ring_of(border, runs, least, tolerance)
+                if drawn[k] is not None and points is not None:
                     _take_positions(border, runs, points, reach_mm)
-                drawn[k] = _accepted(border, corners(border, runs, 1.5 * tolerance, closed=True), factor * tolerance)
+                    moved = _ring_of(border, runs, least, tolerance + 2.5 * points.spacing_mm)
+                    drawn[k] = drawn[k] if moved is None else moved
         if all(ring is not None for ring in drawn):
             break
     return [raw if ring is None else ring for raw, ring in zip(borders, drawn, strict=True)]
@@ -132,9 +141,9 @@ def described(rings: Sequence[_Ring], spacing_mm: float, noise_mm: float) -> lis
     none = np.empty(0)
     runs = [_runs(ring, none, per_mm, alone)[0] for ring in rings]
     rings = [_begun_at_a_corner(ring, own) for ring, own in zip(rings, runs, strict=True)]
-    found = [_runs(ring, none, per_mm, alone) for ring in rings]
+    tried = peaks_of([run for own in runs for run in own])
+    found = [_runs(ring, none, per_mm, PRICES) for ring in rings]
     least, best = math.fsum(cost for _, cost in found), [own for own, _ in found]
-    tried = peaks_of([run for own in best for run in own])
     systems: list[float] = []
     while len(systems) < _SYSTEMS:
         better: tuple[float, list[float], list[list[Run]]] | None = None
@@ -151,6 +160,11 @@ def described(rings: Sequence[_Ring], spacing_mm: float, noise_mm: float) -> lis
         if better is None or better[0] >= least:
             break
         least, systems, best = better
+    for k, ring in enumerate(rings):
+        if len(best[k]) < _FEWEST and len(ring.breaks) <= _FEW_BREAKS:
+            # a few points never show a triangle: it is the cheapest way to cut the corners of a rectangle
+            longest = max(best[k], key=lambda run: run.length).direction if best[k] else 0.0
+            best[k] = _runs(ring, pairs_of([longest]), per_mm, PRICES._replace(free=PRICES.sharp))[0]
     return [(ring.border, own) for ring, own in zip(rings, best, strict=True)]
 
 
@@ -251,11 +265,11 @@ def _begun_at_a_corner(ring: _Ring, runs: Sequence[Run]) -> _Ring:
     """The same ring from its clearest corner on: where a description begins, it has a corner."""
     if len(runs) < 3:
         return ring
+    # where the ring begins now there is an end of an edge, but perhaps no corner
     clear = [
-        abs(math.sin(b.direction - a.direction)) * min(a.length, b.length)
-        for a, b in zip((runs[-1], *runs[:-1]), runs, strict=True)
+        abs(math.sin(b.direction - a.direction)) * min(a.length, b.length) for a, b in itertools.pairwise(runs)
     ]
-    first = runs[max(range(len(runs)), key=clear.__getitem__)].first % len(ring.border)
+    first = runs[1 + max(range(len(clear)), key=clear.__getitem__)].first % len(ring.border)
     n = len(ring.border)
     turned = np.sort((ring.breaks[:-1] - first) % n)
     return _Ring(border=np.concatenate((ring.border[first:], ring.border[:first])), breaks=np.append(turned, n))
@@ -270,6 +284,39 @@ def _take_positions(border: FloatArray, runs: Sequence[Run], points: EdgePoints,
         shift = min(max(usual if own is None else own, -points.spacing_mm), points.spacing_mm)
         run.x += shift * math.sin(run.direction)
         run.y -= shift * math.cos(run.direction)
+
+
+def without_short(border: FloatArray, runs: Sequence[Run], least_mm: float) -> list[Run]:
+    """The edges of a closed border without those that are shorter between their corners, the shortest first.
+
+    Where the neighbours of such an edge are parallel, they are one edge.
+    """
+    left = list(runs)
+    while len(left) > 4:
+        lengths = [_length_between(border, left, k) for k in range(len(left))]
+        k = min(range(len(left)), key=lengths.__getitem__)
+        if lengths[k] >= least_mm:
+            break
+        before, after = left[k - 1], left[(k + 1) % len(left)]
+        if math.cos(after.direction - before.direction) > _SAME:
+            if len(left) < 6:
+                break
+            a, b = before.length, after.length
+            before.x, before.y = (before.x * a + after.x * b) / (a + b), (before.y * a + after.y * b) / (a + b)
+            before.direction = before.direction if a >= b else after.direction
+            before.last, before.length = after.last + (len(border) if after.last <= before.first else 0), a + b
+            left = [run for run in left if run is not left[k] and run is not after]
+        else:
+            del left[k]
+    return left
+
+
+def _length_between(border: FloatArray, runs: Sequence[Run], k: int) -> float:
+    """The length of an edge from its first corner to its last one, along its direction."""
+    before, run, after = runs[k - 1], runs[k], runs[(k + 1) % len(runs)]
+    start = crossing(before, run) or projected(tuple(border[run.first % len(border)].tolist()), run)
+    end = crossing(run, after) or projected(tuple(border[run.last % len(border)].tolist()), run)
+    return (end[0] - start[0]) * math.cos(run.direction) + (end[1] - start[1]) * math.sin(run.direction)
 
 
 def _rings(polygon: Polygon) -> list[FloatArray]:
@@ -301,8 +348,10 @@ def _turned(ring: FloatArray, is_hole: bool) -> FloatArray:
     return np.concatenate((turned[start:], turned[:start]))
 
 
-def _accepted(ring: FloatArray, places: Sequence[Point], tolerance: float) -> FloatArray | None:
-    """The corners as a ring where they make a sound one near the raw ring; small loops at corners are cut off."""
+def _ring_of(border: FloatArray, runs: Sequence[Run], least_mm: float, tolerance: float) -> FloatArray | None:
+    """A sound ring through the corners of edges, if it lies near the raw one; small loops at corners are cut off."""
+    copies = [dataclasses.replace(run) for run in runs]
+    places = corners(border, without_short(border, copies, least_mm), math.inf, closed=True)
     if len(places) < 3:
         return None
     drawn = snapped_ring(np.array(places))
@@ -312,4 +361,4 @@ def _accepted(ring: FloatArray, places: Sequence[Point], tolerance: float) -> Fl
         if not parts:
             return None
         drawn = shapely.get_coordinates(max(parts, key=lambda part: part.area).exterior)[:-1]
-    return None if differ_by_more(drawn, ring, _MOVED * tolerance * Polygon(ring).length) else drawn
+    return None if differ_by_more(drawn, border, _MOVED * tolerance * Polygon(border).length) else drawn

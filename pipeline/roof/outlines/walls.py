@@ -25,7 +25,7 @@ from pipeline.roof.outlines.description import Prices
 from pipeline.roof.outlines.exterior import breaks_of, described_chain, pairs_of, peaks_of
 from pipeline.roof.partition import RoofPartition
 
-PRICES = Prices(edge=6.0, free=14.0, change=4.0, jog=9.0, sharp=60.0, flat=60.0)
+PRICES = Prices(edge=6.0, free=14.0, change=4.0, sharp=60.0, flat=60.0)
 """A wall inside a block is seen less well than an outline: it costs more to bend it."""
 _NOISE_SPACINGS, _NOISE_M = 0.8, 0.4
 """Standard deviation of the border between two units about their wall: in point spacings, and at least."""
@@ -85,10 +85,28 @@ def divided(
     cells, owners = _cells(outline_mm, chords, xy_mm, unit)
     lost = set(units.labels.tolist()) - set(owners)
     if lost:
-        # a unit that no wall separates keeps the border that its points show
-        raw = [polygon.exterior for polygon, label in zip(units.polygons, units.labels.tolist(), strict=True) if label in lost]
-        cells, owners = _cells(outline_mm, [*chords, *(np.asarray(ring.coords) for ring in raw)], xy_mm, unit)
+        # a unit that no wall separates is drawn around its own points
+        directions = pairs_of(peaks_of(_edge_runs(edges))[:3])
+        around = [
+            _drawn_around(polygon.exterior, directions, spacing_m)
+            for polygon, label in zip(units.polygons, units.labels.tolist(), strict=True)
+            if label in lost
+        ]
+        cells, owners = _cells(outline_mm, [*chords, *around], xy_mm, unit)
     return _united(cells, owners)
+
+
+def _drawn_around(ring: shapely.LinearRing, directions: FloatArray, spacing_m: float) -> FloatArray:
+    """A closed border (n, 2) with straight edges, in some directions or others; as it is if it has too few edges."""
+    border = np.asarray(ring.coords)
+    start = int(np.argmax(np.hypot(*(border - border.mean(axis=0)).T)))
+    border = np.concatenate((border[start:-1], border[:start]))
+    opened = np.concatenate((border, border[:1]))
+    runs = described_chain(opened, directions, 1e3 * spacing_m, _noise_mm(spacing_m), PRICES)
+    if len(runs) < 3:
+        return opened
+    places = np.array(corners(border, runs, math.inf, closed=True))
+    return np.concatenate((places, places[:1]))
 
 
 def _noise_mm(spacing_m: float) -> float:
