@@ -1,8 +1,8 @@
 """Outlines of different candidates that overlap, made disjoint: each piece of an overlap goes to one of the two.
 
 Outlines drawn one by one end about half a point spacing outside of the outermost points, so those of two sheds that
-touch cross. What becomes of an overlap follows from the two outlines and their points alone: whoever looks at it, in
-whichever order and tile, decides alike. A third outline changes nothing between the two. Everything is done in integer
+touch cross. The division of an overlap follows from the two outlines and their points alone, so two tasks decide alike,
+whatever the order and the tiles. A third outline changes nothing between the two. Everything is done in integer
 millimetres of the CRS; a border between two outlines has the same corners on both sides.
 """
 
@@ -152,8 +152,8 @@ def left_of(
 ) -> MultiPolygon:
     """An outline without the parts of its overlaps that it lost; those that it kept give it their corners.
 
-    Needles are cut off, and parts below the least area left out, except the largest. Nothing is added beyond the rounding
-    of common corners to 1 mm. An outline that others took whole is returned as it is.
+    Needles are cut off, and parts below the least area left out, except the largest. Nothing is added, apart from the
+    rounding of common corners to 1 mm. An outline that others took whole is returned as it is.
     """
     pieces = [*kept, *lost]
     if not pieces:

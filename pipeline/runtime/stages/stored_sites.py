@@ -87,6 +87,7 @@ def _by_owner(sites: Iterable[RejectedSite]) -> list[tuple[Tile, list[RejectedSi
 
 
 def group_figures(sites: tuple[CandidateSite, ...], grid: TileGrid) -> GroupFigures:
+    """What the driver needs to know of a group."""
     return GroupFigures(
         owner=sites[0].owner,
         count=len(sites),

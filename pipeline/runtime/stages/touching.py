@@ -1,7 +1,7 @@
 """Candidates whose outlines may touch: their outlines are drawn before they are modelled, and overlaps divided.
 
 A task redraws those candidates of one owner that come near others, of whichever tiles. It needs the outlines of these
-others as they are drawn alone, never what other tasks decide: a candidate is drawn once, and again near a tile's border.
+others as they are drawn alone, never what other tasks decide. Near a tile's border a candidate is drawn twice.
 """
 
 from __future__ import annotations
