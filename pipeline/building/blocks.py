@@ -33,7 +33,7 @@ def blocks(building: Building, plan: RoofPlan | None) -> Iterator[NamedForm[Draw
         if plan.raw is not None:
             outlines.append(("the raw outline", outline(plan.raw)))
     hull = hull_of_points(roof.points)
-    if hull is not None:
+    if hull is not None and roof.outline_mm is None:
         outlines.append(("the points' hull", MultiPolygon([shapely.transform(hull, lambda xy: np.rint(xy * 1e3))])))
     tolerance_m, least_m2 = settings.simplification_spacings * roof.spacing_m, settings.min_part_area_m2
     for words, footprint in outlines:

@@ -252,7 +252,9 @@ def _traced_plan(roof: RoofPoints, planes: Sequence[Plane], settings: RoofSettin
         if roof.facades is not None and settings.at_walls:
             reach_m = 1e-3 * mixed_pulse_reach_mm(around, edge_points)
             drawn = extra("walls_beneath")(drawn, roof.facades, reach_m, settings.usual_overhang_m).outline_mm
-    return RoofPlan(planes=tuple(planes), faces=faces, outline_mm=drawn, raw=partition)
+    # what was drawn with regard to others must not go beyond it
+    raw = partition if roof.outline_mm is None else None
+    return RoofPlan(planes=tuple(planes), faces=faces, outline_mm=drawn, raw=raw)
 
 
 def drawn_outline(roof: RoofPoints, settings: RoofSettings) -> MultiPolygon:

@@ -329,8 +329,8 @@ class _Search:
         if isinstance(site, RejectedSite):
             return True
         if record.input_hash is None:
-            # the outline of a unit depends on all units of its block, which may reach beyond the split tiles
-            return site.block is None
+            # an outline drawn with regard to others depends on these, which may reach beyond the split tiles
+            return site.block is None and site.outline is None
         plan, roof = self.context.plan, self.request.settings.building.roof
         _, facts = gather(self.context.scratch, plan.grid, site, plan.gps_kind, roof)
         return facts.input_hash == record.input_hash

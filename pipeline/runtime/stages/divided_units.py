@@ -53,6 +53,9 @@ from pipeline.terrain.unit_division import smallest_points, units_of
 from pipeline.tiling import MM, Tile, TileGrid
 
 _POINTS_PER_TASK = 50_000
+_REACH_MM, _REACH_SPACINGS, _SPARSE_MM = 1000, 4.0, 3000
+"""How far from its points an outline may end: outlines end within 3 point spacings, which are 3 m at most where they
+are drawn, and few boxes hold a sixteenth of their points in the roof."""
 _KEY_DIGITS = 16
 
 
@@ -252,8 +255,6 @@ class _Restored:
 
 def divide(sites: Sequence[CandidateSite], task: UnitTask) -> tuple[list[CandidateSite], dict[str, int]]:
     """The units of some candidates, whose points are stored again, and the CRC-32 of these points by tile."""
-    if task.scene.units.split == "nothing":
-        return list(sites), {}
     found: list[CandidateSite] = []
     restored = _Restored(task.folder)
     for site in sites:
@@ -291,8 +292,11 @@ def _units_of_site(site: CandidateSite, task: UnitTask, restored: _Restored) -> 
         return [site]
     points = np.concatenate(pieces)
     x, y, z = points["x"].astype(np.int64), points["y"].astype(np.int64), points["z"].astype(np.int64)
-    aligned = _aligned_mm(points, (x, y, z), task.roof.min_strip_offset_m)
     settings = task.scene.units
+    site = dataclasses.replace(site, reach_mm=_reach_mm(x, y))
+    if settings.split == "nothing":
+        return [site]
+    aligned = _aligned_mm(points, (x, y, z), task.roof.min_strip_offset_m)
     if site.is_glass:
         # the bays of a greenhouse lie between gutters
         settings = dataclasses.replace(settings, split="steps")
@@ -319,9 +323,17 @@ def _units_of_site(site: CandidateSite, task: UnitTask, restored: _Restored) -> 
             ranges=tuple(ranges[k]),
             points=sum(part.stop - part.start for part in ranges[k]),
             block=site.building_id,
+            reach_mm=_reach_mm(x[unit == k], y[unit == k]),
         )
         for k, first in enumerate(firsts.tolist())
     ]
+
+
+def _reach_mm(x: IntArray, y: IntArray) -> tuple[int, int, int, int]:
+    """The box around points, and what an outline drawn around them may cover beside it."""
+    x0, y0, x1, y1 = int(x.min()), int(y.min()), int(x.max()), int(y.max())
+    beside = round(_REACH_MM + _REACH_SPACINGS * min(_SPARSE_MM, math.sqrt((x1 - x0) * (y1 - y0) / len(x))))
+    return x0 - beside, y0 - beside, x1 + beside, y1 + beside
 
 
 def with_strips_that_disagree(

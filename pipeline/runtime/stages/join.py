@@ -38,7 +38,7 @@ from pipeline.runtime.stages.divided_units import BorderSites, find_units
 from pipeline.runtime.stages.open_fragments import BorderFacets, Finished, OpenSurfaces, finished
 from pipeline.runtime.stages.sites import UNITS, Joined
 from pipeline.runtime.stages.split import Split, Splits
-from pipeline.runtime.stages.stored_sites import joined_of, store_sites
+from pipeline.runtime.stages.stored_sites import joined_of, may_touch, store_sites
 from pipeline.runtime.stages.tile_sites import TileSitesFigures, by_owner, figures_of
 from pipeline.terrain.candidates import NOWHERE, Surfaces
 from pipeline.terrain.fragment_sums import N_SUMS
@@ -298,7 +298,12 @@ def join(
         for part, figures in enumerate(brief.owned)
     ]
     units = find_units(context, settings, roof, splits, owned, crs_name, outlines=outlines)
-    return joined_of(units, small, splits.keys)
+    joined = joined_of(units, small, splits.keys)
+    if outlines and roof.straight_eaves and may_touch(units.values()):
+        from pipeline.runtime.stages.touching import drawn_apart
+
+        joined = drawn_apart(context, roof, joined)
+    return joined
 
 
 def _joined_borders(context: RunContext, settings: CandidateSettings, splits: Splits) -> dict[Place, JoinBrief]:

@@ -8,9 +8,11 @@ import hashlib
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Generic, TypeVar
 
+import numpy as np
+import shapely
 from shapely import MultiPolygon, Polygon
 
-from pipeline.model import GivenHeights
+from pipeline.model import GivenHeights, IntArray
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.outcomes import Place, part_of
 from pipeline.runtime.stages.window_points import folders_of
@@ -67,7 +69,9 @@ class CandidateSite:
     block: str | None = None
     """The id of the candidate from which the unit was divided; None where it was not divided."""
     outline: MultiPolygon | None = None
-    """Its part of the outline drawn around touching units, in metres; None where it touches no other unit."""
+    """Its outline where it was drawn with regard to others that touch it, in metres; None where none does."""
+    reach_mm: tuple[int, int, int, int] | None = None
+    """xmin, ymin, xmax, ymax of what an outline around its points may cover; None in a given footprint."""
     override: Override | None = None
     """The override of this building, as far as it took effect; None where there is none."""
 
@@ -134,6 +138,8 @@ class GroupFigures(Figures):
     """The tiles in which they lie, sorted."""
     overridden: tuple[tuple[str, Override], ...] = ()
     """Ids and overrides of those that are modelled in their own way."""
+    reach_mm: tuple[int, int, int, int] | None = None
+    """xmin, ymin, xmax, ymax of what their outlines may cover; None in given footprints."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -238,6 +244,34 @@ def tiles_of(sites: Iterable[CandidateSite], grid: TileGrid) -> set[Tile]:
                 x0, y0, x1, y1 = (round(value * MM) for value in area.bounds)
                 tiles.update(grid.tiles_over(Window(x0_mm=x0, y0_mm=y0, x1_mm=x1 + 1, y1_mm=y1 + 1)))
     return tiles
+
+
+def near_pairs(sites: Sequence[CandidateSite]) -> IntArray:
+    """Pairs of sites by their numbers, (k, 2), the smaller first, whose outlines may touch.
+
+    Units of one block that were drawn together do not: their borders are common already.
+    """
+    number = np.array([k for k, site in enumerate(sites) if site.reach_mm is not None], np.int64)
+    boxes = shapely.box(*np.array([sites[k].reach_mm for k in number], np.float64).reshape(-1, 4).T)
+    pairs = [
+        (i, j)
+        for i, j in number[shapely.STRtree(boxes).query(boxes).T].tolist()
+        if i < j and (sites[i].block is None or sites[i].block != sites[j].block or not _are_drawn(sites[i], sites[j]))
+    ]
+    return np.array(sorted(pairs), np.int64).reshape(-1, 2)
+
+
+def _are_drawn(*sites: CandidateSite) -> bool:
+    return all(site.outline is not None for site in sites)
+
+
+def box_around(boxes: Iterable[tuple[int, int, int, int] | None]) -> tuple[int, int, int, int] | None:
+    """The smallest box around some, None without any."""
+    known = np.array([box for box in boxes if box is not None], np.int64).reshape(-1, 4)
+    if len(known) == 0:
+        return None
+    (x0, y0), (x1, y1) = known[:, :2].min(axis=0).tolist(), known[:, 2:].max(axis=0).tolist()
+    return x0, y0, x1, y1
 
 
 def folders_with_points(ranges: Iterable[PointRange]) -> set[str]:

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
+
+import shapely
 
 from pipeline.model import Reason
 from pipeline.runtime.run_context import RunContext
@@ -20,9 +22,11 @@ from pipeline.runtime.stages.sites import (
     RejectedFigures,
     RejectedSite,
     Stored,
+    box_around,
     by_owner,
     folders_with_points,
     largest_first,
+    near_pairs,
     tiles_of,
 )
 from pipeline.tiling import Tile, TileGrid
@@ -47,6 +51,8 @@ class SitesBrief:
     """CRC-32 of the points that the task stored again, by the keys of their tiles."""
     warnings: tuple[str, ...] = ()
     """What was odd but usable."""
+    come_near: bool = False
+    """Whether two of its candidates may have outlines that touch, other than units of one block."""
 
 
 def stored_sites(
@@ -64,10 +70,11 @@ def stored_sites(
     return InParts(
         parts=(*groups, *(sites for _, sites in listed)),
         brief=SitesBrief(
-            groups=tuple(_group_figures(group, grid) for group in groups),
+            groups=tuple(group_figures(group, grid) for group in groups),
             rejected=tuple(_rejected_figures(owner, sites) for owner, sites in listed),
             checksums=checksums or {},
             warnings=tuple(warnings),
+            come_near=len(near_pairs([site for _, sites in owned for site in sites])) > 0,
         ),
     )
 
@@ -79,7 +86,8 @@ def _by_owner(sites: Iterable[RejectedSite]) -> list[tuple[Tile, list[RejectedSi
     return sorted(found.items())
 
 
-def _group_figures(sites: tuple[CandidateSite, ...], grid: TileGrid) -> GroupFigures:
+def group_figures(sites: tuple[CandidateSite, ...], grid: TileGrid) -> GroupFigures:
+    """What the driver needs to know of a group."""
     return GroupFigures(
         owner=sites[0].owner,
         count=len(sites),
@@ -91,6 +99,7 @@ def _group_figures(sites: tuple[CandidateSite, ...], grid: TileGrid) -> GroupFig
         overridden=tuple(
             (site.building_id, site.override) for site in sites if site.override is not None and site.override.remodels
         ),
+        reach_mm=box_around(site.reach_mm for site in sites),
     )
 
 
@@ -140,6 +149,14 @@ def scale_of(points: int) -> int:
     while scale < _LARGEST_SCALE and points > _GROUPS * _POINTS_PER_GROUP * scale:
         scale *= 2
     return scale
+
+
+def may_touch(briefs: Collection[SitesBrief]) -> bool:
+    """Whether candidates may have outlines that touch: those of one task, or of tasks whose boxes meet."""
+    reach = [box_around(group.reach_mm for group in brief.groups) for brief in briefs]
+    boxes = [shapely.box(*box) for box in reach if box is not None]
+    meet = len(shapely.STRtree(boxes).query(boxes, predicate="intersects").T) > len(boxes)
+    return meet or any(brief.come_near for brief in briefs)
 
 
 def joined_of(briefs: Mapping[Place, SitesBrief], small_fragments: int, keys: Mapping[Tile, str]) -> Joined:

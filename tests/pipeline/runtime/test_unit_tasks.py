@@ -205,7 +205,12 @@ def test_units_keep_every_point_once_in_the_tile_that_holds_it(row: npt.NDArray[
 
 def test_a_candidate_of_one_unit_stays_as_it_is(terrace: Terrace) -> None:
     site, scratch, _ = terrace
-    assert divided(site, ONE_TILE, scratch, UnitSettings(split="nothing")) == [site]
+    (whole,) = divided(site, ONE_TILE, scratch, UnitSettings(split="nothing"))
+    assert dataclasses.replace(whole, reach_mm=None) == site
+    points = points_of(scratch, site)
+    assert whole.reach_mm is not None
+    (x0, y0, x1, y1), x, y = whole.reach_mm, points["x"], points["y"]
+    assert 1000 < x.min() - x0 == x1 - x.max() == y.min() - y0 == y1 - y.max() < 4000
     empty = CandidateSite(building_id="a", owner=site.owner, ranges=(), points=0)
     assert divided(empty, ONE_TILE, scratch, UnitSettings()) == [empty]
 

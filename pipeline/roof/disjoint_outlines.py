@@ -1,0 +1,208 @@
+"""Outlines of different candidates that overlap, made disjoint: each piece of an overlap goes to one of the two.
+
+Outlines drawn one by one end about half a point spacing outside of the outermost points, so those of two sheds that
+touch cross. The division of an overlap follows from the two outlines and their points alone, so two tasks decide alike,
+whatever the order and the tiles. A third outline changes nothing between the two. Everything is done in integer
+millimetres of the CRS; a border between two outlines has the same corners on both sides.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Iterator, Sequence
+
+import numpy as np
+import shapely
+from shapely import MultiPolygon, Polygon
+
+from pipeline.model import FloatArray, IntArray
+from pipeline.roof.footprint import polygons_of
+
+# None of these is a setting: they choose between ways to divide an area that is narrower than a few point spacings.
+_SMALL_MM2 = 2e4
+"""A piece of less goes to the higher candidate: it changes no corner that anyone sees."""
+_CORNER_COS = 0.98
+"""Cosine of the least turn that counts as a corner: 11 degrees."""
+_ACUTE_COS = 0.7
+"""An inner angle is acute where its cosine is larger: 45 degrees."""
+_SHORT_MM = 700.0
+"""Edges below this are short."""
+_ACUTE_COST, _SHORT_COST, _PART_COST, _WRONG_COST = 3.0, 1.0, 4.0, 2.0
+"""Costs of what a division leaves, in corners, and of a point on the wrong side."""
+_KEPT_SHARE = 0.4
+"""A candidate that would keep less of its outline keeps the piece instead, if the other can spare it."""
+_BARRED = 1e6
+"""Cost of leaving too little."""
+_FEWEST_WRONG = 2
+"""An overlap is divided along a chord where at least so many points lie on the wrong side without one."""
+_DIRECTIONS = 3
+"""Longest edges of an overlap that give a chord its direction."""
+_NEEDLE_MM = 120.0
+"""Half the width of a part that is not left of an outline: no wing of a house is as narrow."""
+_SHORTEST_MM = 20.0
+"""Corners nearer to each other are united when a solid is made, which would move a common border."""
+_MITRE = 6.0
+"""Offset corners sharper than 20 degrees are cut."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Claim:
+    """A candidate that overlaps others."""
+
+    name: str
+    """Its id."""
+    outline_mm: MultiPolygon
+    """Drawn around its points alone, or together with the other units of its block; integer millimetres."""
+    points_mm: IntArray
+    """(n, 3), ascending by x; n may be 0."""
+
+    @property
+    def rank(self) -> tuple[float, str]:
+        """The higher one first, which covers the lower one's eave; then by id."""
+        return -float(np.median(self.points_mm[:, 2])) if len(self.points_mm) else 0.0, self.name
+
+
+def divided(first: Claim, second: Claim) -> tuple[list[Polygon], list[Polygon]]:
+    """The parts of the overlap of two outlines that the first keeps, and those that the second keeps.
+
+    Both are in integer millimetres and do not overlap. The result is the same, swapped, for swapped arguments.
+    """
+    if second.rank < first.rank:
+        lower, upper = divided(second, first)
+        return upper, lower
+    kept: tuple[list[Polygon], list[Polygon]] = ([], [])
+    pieces = polygons_of(shapely.intersection(first.outline_mm, second.outline_mm, grid_size=1.0))
+    for piece in pieces:
+        if piece.area < _SMALL_MM2:
+            kept[0].append(piece)
+            continue
+        for side, part in zip(kept, _shares(piece, first, second), strict=True):
+            side.extend(part)
+    return kept
+
+
+def _shares(piece: Polygon, first: Claim, second: Claim) -> tuple[list[Polygon], list[Polygon]]:
+    """The shares of both in one piece of their overlap, by the least cost; of equal ones the first is taken."""
+    own, other = _inside(piece, first.points_mm), _inside(piece, second.points_mm)
+    options = [([piece], list[Polygon](), len(other)), (list[Polygon](), [piece], len(own))]
+    if min(len(own), len(other)) >= _FEWEST_WRONG:
+        options.extend(_chords(piece, own, other))
+    costs = []
+    for mine, theirs, wrong in options:
+        cost = _WRONG_COST * wrong
+        for claim, lost in ((first, theirs), (second, mine)):
+            left = shapely.difference(claim.outline_mm, MultiPolygon(lost), grid_size=1.0) if lost else claim.outline_mm
+            cost += _effort(left) + (_BARRED if left.area < _KEPT_SHARE * claim.outline_mm.area else 0.0)
+        costs.append(cost)
+    mine, theirs, _ = options[int(np.argmin(costs))]
+    return mine, theirs
+
+
+def _inside(piece: Polygon, points_mm: IntArray) -> IntArray:
+    """The places (k, 2) of those points (n, 3), ascending by x, that lie in a piece."""
+    west, south, east, north = piece.bounds
+    first, last = np.searchsorted(points_mm[:, 0], [west, east + 1])
+    near = points_mm[first:last, :2]
+    near = near[(near[:, 1] >= south) & (near[:, 1] <= north)]
+    inside: IntArray = near[shapely.contains_xy(piece, near[:, 0], near[:, 1])]
+    return inside
+
+
+def _chords(piece: Polygon, own: IntArray, other: IntArray) -> Iterator[tuple[list[Polygon], list[Polygon], int]]:
+    """Divisions of a piece along a line parallel to one of its longest edges, where most points are on their side."""
+    ring = shapely.get_coordinates(piece.exterior)
+    edges = np.diff(ring, axis=0)
+    corner = np.floor(ring[0])
+    points = np.concatenate((own, other)) - corner
+    sign = np.repeat([1, -1], [len(own), len(other)])
+    reach = 2.0 * float(np.ptp(ring, axis=0).sum())
+    for k in np.argsort(-np.hypot(edges[:, 0], edges[:, 1]), kind="stable")[:_DIRECTIONS].tolist():
+        along = edges[k] / np.hypot(*edges[k])
+        across = np.array([-along[1], along[0]])
+        offset = points @ across
+        order = np.argsort(offset, kind="stable")
+        behind = np.cumsum(sign[order])[:-1]  # own points less others on the near side
+        best = int(np.argmax(np.abs(behind - 0.5 * sign.sum())))
+        middle = across * 0.5 * (offset[order[best]] + offset[order[best + 1]]) + corner
+        ends = np.rint(np.array([middle - along * reach, middle + along * reach]))
+        half = Polygon([*ends, ends[1] - np.rint(across * reach), ends[0] - np.rint(across * reach)])
+        near = polygons_of(shapely.intersection(piece, half, grid_size=1.0))
+        far = polygons_of(shapely.difference(piece, half, grid_size=1.0))
+        wrong = len(own) - int(behind[best]) if behind[best] > 0.5 * sign.sum() else len(other) + int(behind[best])
+        yield (near, far, wrong) if behind[best] > 0.5 * sign.sum() else (far, near, wrong)
+
+
+def _effort(area: shapely.Geometry) -> float:
+    """What it takes to describe an area: its corners; acute ones, short edges and parts cost more."""
+    cost = 0.0
+    for polygon in polygons_of(area):
+        cost += _PART_COST
+        for ring in shapely.get_rings(polygon).tolist():
+            edges = np.diff(shapely.get_coordinates(ring), axis=0)
+            lengths = np.hypot(edges[:, 0], edges[:, 1])
+            units = edges / lengths[:, None]
+            cosine = (units * np.roll(units, 1, axis=0)).sum(axis=1)
+            cost += np.count_nonzero(cosine < _CORNER_COS) + _ACUTE_COST * np.count_nonzero(cosine < -_ACUTE_COS)
+            cost += _SHORT_COST * np.count_nonzero(lengths < _SHORT_MM)
+    return cost
+
+
+def left_of(
+    outline_mm: MultiPolygon, kept: Iterable[Polygon], lost: Sequence[Polygon], min_area_m2: float
+) -> MultiPolygon:
+    """An outline without the parts of its overlaps that it lost; those that it kept give it their corners.
+
+    Needles are cut off, and parts below the least area left out, except the largest. Nothing is added, apart from the
+    rounding of common corners to 1 mm. An outline that others took whole is returned as it is.
+    """
+    pieces = [*kept, *lost]
+    if not pieces:
+        return outline_mm
+    lines = shapely.boundary([outline_mm, *pieces])
+    cells = shapely.get_parts(shapely.polygonize([shapely.union_all(lines, grid_size=1.0)]))
+    places = shapely.point_on_surface(cells)
+    is_own = shapely.intersects(outline_mm, places)
+    if lost:
+        is_own &= ~shapely.intersects(shapely.union_all(lost), places)
+    own = polygons_of(shapely.coverage_union_all(cells[is_own]))
+    if lost:
+        own = [part for polygon in own for part in _without_needles(polygon)] or own
+    own = [_without_short_edges(polygon) for polygon in own]
+    large = [polygon for polygon in own if polygon.area >= min_area_m2 * 1e6]
+    if not own:
+        return outline_mm
+    # the order of the pieces decides where rings begin
+    return shapely.normalize(MultiPolygon(large or [max(own, key=lambda polygon: (polygon.area, polygon.bounds))]))
+
+
+def _without_needles(polygon: Polygon) -> list[Polygon]:
+    """A polygon without parts that are narrower than two needle widths; nothing is left of one that is a needle."""
+    inner = shapely.buffer(polygon, -_NEEDLE_MM, join_style="mitre", mitre_limit=_MITRE)
+    opened = shapely.buffer(inner, _NEEDLE_MM, join_style="mitre", mitre_limit=_MITRE)
+    needles = [one for one in polygons_of(shapely.difference(polygon, opened)) if _is_needle(one)]
+    return polygons_of(shapely.difference(polygon, MultiPolygon(needles), grid_size=1.0)) if needles else [polygon]
+
+
+def _is_needle(part: Polygon) -> bool:
+    """Whether a part that an opening removes is more than a film along an edge or a cut corner."""
+    return part.area > 0.5 * _NEEDLE_MM * _NEEDLE_MM and 2.0 * part.area > 0.1 * _NEEDLE_MM * part.length
+
+
+def _without_short_edges(polygon: Polygon) -> Polygon:
+    """A polygon without edges that a solid cannot have: the corner at one end is cut off where that adds nothing."""
+    rings = [_thinned(shapely.get_coordinates(ring)[:-1]) for ring in shapely.get_rings(polygon.normalize()).tolist()]
+    thinned = Polygon(rings[0], rings[1:])
+    return thinned if thinned.is_valid else polygon
+
+
+def _thinned(ring: FloatArray) -> FloatArray:
+    """A ring (n, 2) with the area to its right, without the corners whose removal shortens it at a short edge."""
+    while len(ring) > 4:
+        into, out = ring - np.roll(ring, 1, axis=0), np.roll(ring, -1, axis=0) - ring
+        cut_off = into[:, 1] * out[:, 0] - into[:, 0] * out[:, 1]
+        short = np.hypot(out[:, 0], out[:, 1]) < _SHORTEST_MM
+        free = (short | np.roll(short, 1)) & (cut_off >= 0.0)
+        if not free.any():
+            break
+        ring = np.delete(ring, int(np.argmin(np.where(free, cut_off, np.inf))), axis=0)
+    return ring

@@ -1,0 +1,192 @@
+"""Candidates whose outlines may touch: their outlines are drawn before they are modelled, and overlaps divided.
+
+A task redraws those candidates of one owner that come near others, of whichever tiles. It needs the outlines of these
+others as they are drawn alone, never what other tasks decide. Near a tile's border a candidate is drawn twice.
+"""
+
+from __future__ import annotations
+
+import collections
+import dataclasses
+import functools
+import time
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import shapely
+from shapely import MultiPolygon
+
+from pipeline.errors import BuildingError
+from pipeline.io.gps_time import GpsTimeKind
+from pipeline.model import IntArray
+from pipeline.prepared_cloud import prepare_cloud
+from pipeline.roof.disjoint_outlines import Claim, divided, left_of
+from pipeline.roof.plan import drawn_outline, roof_points
+from pipeline.roof.roof_settings import RoofSettings
+from pipeline.runtime.run_context import RunContext
+from pipeline.runtime.scratch.folder import OpenScratch, Scratch
+from pipeline.runtime.scratch.outcomes import Files, InParts, Place, brief_within, drop_outcomes, key_of
+from pipeline.runtime.stages.gather import gather, points_of
+from pipeline.runtime.stages.sites import (
+    CandidateSite,
+    GroupFigures,
+    Joined,
+    Stored,
+    StoredGroup,
+    box_around,
+    folders_around,
+    near_pairs,
+)
+from pipeline.runtime.stages.stored_sites import group_figures
+from pipeline.tiling import MM, Tile, TileGrid
+
+STAGE = "touching"
+"""The stage under which groups are stored whose candidates were drawn again."""
+_BESIDE_MM = 2000.0
+"""An outline that ends so near to another one stays as it was compared: with the hidden points at walls, which are
+known when it is modelled, it could become that much larger."""
+_HELD = 16
+"""Candidates whose points stay in memory from one overlap to the next."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TouchTask:
+    """The candidates of one owner, and those of others that may touch them."""
+
+    own: tuple[StoredGroup, ...]
+    """Groups of the owner."""
+    others: tuple[StoredGroup, ...]
+    """Groups of other owners whose boxes meet those of the owner."""
+    roof: RoofSettings
+    """How outlines are drawn."""
+    grid: TileGrid
+    """The lattice."""
+    scratch: Scratch
+    """Holds all of them."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TouchBrief:
+    """The owner's groups in which an outline was drawn, by their numbers; in this order they are parts."""
+
+    groups: Mapping[int, GroupFigures]
+
+
+def drawn_apart(context: RunContext, roof: RoofSettings, joined: Joined) -> Joined:
+    """The candidates of a run, with outlines that do not overlap where they come near each other."""
+    started = time.perf_counter()
+    owned: dict[Tile, list[StoredGroup]] = collections.defaultdict(list)
+    for group in joined.groups:
+        owned[group.figures.owner].append(group)
+    tiles = sorted(owned)
+    reach = [box_around(group.figures.reach_mm for group in owned[tile]) for tile in tiles]
+    boxes = np.array([None if box is None else shapely.box(*box) for box in reach], object)
+    near = collections.defaultdict(list)
+    for i, j in shapely.STRtree(boxes).query(boxes).T.tolist():
+        if i != j:
+            near[i].append(j)
+    tasks = {}
+    for k, tile in enumerate(tiles):
+        own, box = tuple(owned[tile]), boxes[k]
+        around = [group for j in sorted(near[k]) for group in owned[tiles[j]] if _meets(group, box)]
+        seen = sorted({one for group in (*own, *around) for one in group.figures.tiles})
+        digests = [[group.figures.digest for group in groups] for groups in (own, around)]
+        key = key_of(roof, context.plan.grid, digests, joined.around(seen))
+        tasks[Place(STAGE, tile.key, key)] = TouchTask(
+            own=own, others=tuple(around), roof=roof, grid=context.plan.grid, scratch=context.scratch
+        )
+    drop_outcomes(context.scratch, STAGE, tasks)
+    files: Files[TouchTask, TouchBrief] = Files(reads=_read)
+    found = context.map_stored("outline", draw_apart, tasks, brief_within, files=files, quiet=True)
+    groups: list[StoredGroup] = []
+    for place, task in tasks.items():
+        part = {number: k for k, number in enumerate(found[place].groups)}
+        groups += [
+            Stored(place=place, part=part[k], figures=found[place].groups[k]) if k in part else group
+            for k, group in enumerate(task.own)
+        ]
+    timings = context.progress.timings
+    timings["outline"] = timings.get("outline", 0.0) + time.perf_counter() - started
+    return dataclasses.replace(joined, groups=tuple(groups))
+
+
+def _meets(group: StoredGroup, box: shapely.Polygon | None) -> bool:
+    reach = group.figures.reach_mm
+    return box is not None and reach is not None and bool(box.intersects(shapely.box(*reach)))
+
+
+def _read(task: TouchTask) -> set[str]:
+    """The folders of scratch with the sites and the points of a task, and with what lies around them."""
+    return {folder for group in (*task.own, *task.others) for folder in folders_around(group, task.grid)}
+
+
+def draw_apart(task: TouchTask) -> InParts[TouchBrief]:
+    """The groups of a task in which outlines had to be drawn.
+
+    Raises MemoryError or OSError if scratch cannot be read, or does not fit into memory.
+    """
+    task = dataclasses.replace(task, scratch=OpenScratch(task.scratch.root, task.scratch.attempt))
+    groups = [group.sites(task.scratch) for group in (*task.own, *task.others)]
+    sites = [site for group in groups for site in group]
+    owned = sum(len(group) for group in groups[: len(task.own)])
+    outlines = _outlines_of(sites, owned, task)
+    changed: dict[int, tuple[CandidateSite, ...]] = {}
+    for number, group in enumerate(groups[: len(task.own)]):
+        new = tuple(dataclasses.replace(site, outline=outlines.get(site.building_id, site.outline)) for site in group)
+        if any(site.building_id in outlines for site in group):
+            changed[number] = new
+    figures = {number: group_figures(group, task.grid) for number, group in changed.items()}
+    return InParts(parts=tuple(changed.values()), brief=TouchBrief(groups=figures))
+
+
+def _outlines_of(sites: Sequence[CandidateSite], owned: int, task: TouchTask) -> dict[str, MultiPolygon]:
+    """The outlines, metres, of those of the first `owned` sites that end near others, by their building_id."""
+    pairs = near_pairs(sites)
+    pairs = pairs[pairs[:, 0] < owned]
+    drawn: dict[int, MultiPolygon] = {}
+    for k in np.unique(pairs).tolist():
+        task.scratch.check_cancelled()
+        outline_mm = _drawn_mm(sites[k], task)
+        if outline_mm is not None:
+            drawn[k] = outline_mm
+    known = np.array([i in drawn and j in drawn for i, j in pairs.tolist()], np.bool_)
+    pairs = pairs[known]
+    first, second = (np.array([drawn[k] for k in column.tolist()], object) for column in pairs.T)
+    near = shapely.dwithin(first, second, _BESIDE_MM)
+    overlapping = shapely.intersects(first, second)
+
+    @functools.lru_cache(maxsize=_HELD)
+    def claim(k: int) -> Claim:
+        points = points_of(task.scratch, sites[k])
+        places: IntArray = np.column_stack([points[axis] for axis in "xyz"]).astype(np.int64)
+        return Claim(name=sites[k].building_id, outline_mm=drawn[k], points_mm=places)
+
+    kept: dict[int, list[shapely.Polygon]] = collections.defaultdict(list)
+    lost: dict[int, list[shapely.Polygon]] = collections.defaultdict(list)
+    for i, j in pairs[overlapping].tolist():
+        task.scratch.check_cancelled()
+        of_first, of_second = divided(claim(i), claim(j))
+        kept[i] += of_first
+        lost[i] += of_second
+        kept[j] += of_second
+        lost[j] += of_first
+    outlines = {}
+    for k in np.unique(pairs[near]).tolist():
+        if k < owned:
+            apart = left_of(drawn[k], kept[k], lost[k], task.roof.min_part_area_m2)
+            outlines[sites[k].building_id] = shapely.transform(apart, lambda xy: xy / MM)
+    return outlines
+
+
+def _drawn_mm(site: CandidateSite, task: TouchTask) -> MultiPolygon | None:
+    """The outline of a candidate without regard to others, integer millimetres of the CRS; None where none is drawn."""
+    if site.outline is not None:
+        return shapely.transform(site.outline, lambda xy: np.rint(xy * MM))
+    candidate, _ = gather(task.scratch, task.grid, site, GpsTimeKind.NONE, task.roof)
+    try:
+        roof = roof_points(prepare_cloud(candidate, task.roof.max_points), task.roof)
+        outline_mm = drawn_outline(roof, task.roof)
+    except (BuildingError, shapely.errors.GEOSException):
+        return None
+    corner = np.array(candidate.origin[:2]) * MM
+    return shapely.transform(outline_mm, lambda xy: xy + corner)

@@ -1,0 +1,84 @@
+"""Candidates that touch, end to end: their outlines are disjoint, whichever tiles hold them."""
+
+import dataclasses
+import itertools
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import shapely
+from plain_houses import Houses, write_houses
+from run_tables import rows
+
+from pipeline.runtime.run import RunSummary
+from pipeline.runtime.stages.sites import CandidateSite, near_pairs
+from pipeline.tiling import Tile
+
+SHEDS = (((12.0, 12.0, 24.0, 20.0), 60.0), ((24.3, 13.0, 32.0, 19.0), 54.0), ((14.0, 20.3, 22.0, 27.0), 55.5))
+"""Boxes and elevations of flat roofs; one is much higher than the two at its walls. None touches the fourth."""
+ALONE = ((48.0, 48.0, 58.0, 56.0), 57.0)
+TRUSTED = {"classes": "trust"}
+
+
+@pytest.fixture
+def sheds(tmp_path: Path) -> Path:
+    """The sheds on level ground, classes set."""
+    random = np.random.default_rng(11)
+    x, y = random.uniform(0.0, 70.0, (2, 29_400))
+    z, house = np.full(len(x), 50.0), np.full(len(x), -1, np.int8)
+    for k, ((x0, y0, x1, y1), top) in enumerate((*SHEDS, ALONE)):
+        inside = (x >= x0) & (x < x1) & (y >= y0) & (y < y1)
+        z[inside], house[inside] = top, k
+    z += random.normal(0.0, 0.02, len(x))
+    found = Houses(xyz=np.column_stack((x + 400_000.0, y + 5_700_000.0, z)), house=house)
+    return write_houses(tmp_path / "sheds.laz", found, classes=np.where(house < 0, 2, 6))
+
+
+def overlaps_m2(run_dir: str) -> list[float]:
+    """The overlap of each pair of outlines."""
+    outlines = [shapely.force_2d(shapely.from_wkb(row["geometry"])) for row in rows(run_dir)]
+    return [shapely.intersection(*pair).area for pair in itertools.combinations(outlines, 2)]
+
+
+def test_sheds_that_touch_have_disjoint_outlines_in_any_tiles(
+    sheds: Path, reconstruct: Callable[..., RunSummary]
+) -> None:
+    whole = reconstruct(sheds, settings={**TRUSTED, "tile_size_m": 1000.0})
+    assert whole.statuses["ok"] == 4
+    assert max(overlaps_m2(whole.run_dir)) < 0.002  # a border's vertices are rounded to 1 mm
+    # borders of tiles between the sheds and through them
+    for size_m, shift_m in ((30.0, 24.1), (24.0, 0.0), (41.5, 20.2)):
+        tiles = {"tile_size_m": size_m, "lattice_x_m": shift_m, "lattice_y_m": shift_m}
+        assert reconstruct(sheds, settings={**TRUSTED, **tiles}).digest == whole.digest
+
+
+def test_a_second_run_in_a_work_folder_draws_nothing_again(
+    sheds: Path, tmp_path: Path, reconstruct: Callable[..., RunSummary]
+) -> None:
+    first, second = (
+        reconstruct(sheds, settings=TRUSTED, work=str(tmp_path / "work"), out=str(tmp_path / name))
+        for name in ("one", "two")
+    )
+    assert second.digest == first.digest
+    kept = list((tmp_path / "work").glob("**/kept/touching/*/*"))
+    assert len(kept) > 0
+    third = reconstruct(sheds, settings=TRUSTED, work=str(tmp_path / "work"), out=str(tmp_path / "three"))
+    assert third.digest == first.digest
+    assert [path.stat().st_mtime_ns for path in kept] == [
+        path.stat().st_mtime_ns for path in (tmp_path / "work").glob("**/kept/touching/*/*")
+    ]
+
+
+def test_units_of_one_block_that_were_drawn_together_are_not_compared() -> None:
+    square = shapely.MultiPolygon([shapely.box(0, 0, 1, 1)])
+    site = CandidateSite(
+        building_id="a", owner=Tile(0, 0), ranges=(), points=9, block="x", outline=square, reach_mm=(0, 0, 9, 9)
+    )
+    other = dataclasses.replace(site, building_id="b", reach_mm=(5, 5, 12, 12))
+    far = dataclasses.replace(site, building_id="c", reach_mm=(50, 5, 60, 12), block=None)
+    given = dataclasses.replace(site, building_id="d", reach_mm=None)
+    assert near_pairs([site, other, far, given]).tolist() == []
+    alone = dataclasses.replace(other, outline=None)
+    assert near_pairs([site, alone, far, given]).tolist() == [[0, 1]]
+    assert near_pairs([far, given, other, dataclasses.replace(site, block=None)]).tolist() == [[2, 3]]
