@@ -34,9 +34,11 @@ SWITCHES = (
     "--disable-background-networking",
     "--disable-component-update",
     "--disable-sync",
-    # WebGL drawn by the processor
+    # WebGL drawn by the processor: only WebGL, and each pixel once
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
+    "--disable-gpu-compositing",
+    "--webgl-antialiasing-mode=none",
 )
 
 
