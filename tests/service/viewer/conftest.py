@@ -97,7 +97,7 @@ def _served(folder: Path, *options: str, **variables: str) -> Iterator[str]:
             return False
 
     try:
-        served.wait_for(answers, "an answer")
+        served.wait_for(answers, "an answer", interval_s=0.1)
         yield url
     finally:
         served.end()
