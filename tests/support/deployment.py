@@ -264,7 +264,7 @@ class Deployment:
             self.supervise()
             return self.status(job_id) in {"successful", "failed", "dismissed"}
 
-        wait_for(over, f"the end of job {job_id}", 2 * LONG_S)
+        wait_for(over, f"the end of job {job_id}", 2 * LONG_S, interval_s=0.25)
         job = self.job(job_id)
         run = StateFolder(self._state).run(job_id, job.attempt)
         good = job.status is JobStatus.SUCCESSFUL

@@ -21,6 +21,6 @@ def finished_job(service: str, tile: Path, **more: object) -> str:
             reported: dict[str, Any] = client.get(f"jobs/{job}").raise_for_status().json()
             return reported if reported["status"] not in {"accepted", "running"} else None
 
-        status = wait_for(over, "the end of the job", JOB_S)
+        status = wait_for(over, "the end of the job", JOB_S, interval_s=0.25)
         assert status["status"] == "successful", status
         return str(job)

@@ -64,15 +64,19 @@ def free_port() -> int:
 def wait_for(
     condition: Callable[[], Value | None], what: str, deadline_s: float = LONG_S, *, interval_s: float = 0.02
 ) -> Value:
-    """Wait until the condition is true; returns its value, or fails after the deadline with the name of `what`."""
-    end = time.monotonic() + deadline_s
+    """Wait until the condition is true; returns its value, or fails after the deadline with the name of `what`.
+
+    After the first seconds it looks less often: what is waited for needs the processor more.
+    """
+    began = time.monotonic()
+    end = began + deadline_s
     while True:
         value = condition()
         if value:
             return value
         if time.monotonic() > end:
             pytest.fail(f"waited {deadline_s:g} s in vain for {what}")
-        time.sleep(interval_s)
+        time.sleep(max(interval_s, min(0.1, (time.monotonic() - began) / 20.0)))
 
 
 def listens(port: int, host: str = "127.0.0.1") -> bool:

@@ -57,7 +57,8 @@ PROGRAM = [sys.executable, "-P", "-m", "service.cli"]
 METHODS = ("arrangement", "fuzzy-sart", "parameter-space-2d", "parameter-space-3d", "kmeans")
 COMMANDS = (
     "simulate suburb --size 70 70 --with-classes --out scene",
-    *(f"reconstruct scene/suburb.laz --method {method} --out {method}" for method in METHODS),
+    "reconstruct scene/suburb.laz --out arrangement",
+    "reconstruct scene/suburb.laz --method kmeans --out kmeans",
     "reconstruct scene/suburb.laz --classes ignore --workers 0 --out serial",
     "reconstruct scene/suburb.laz --classes ignore --workers 2 --out cluster",
     "evaluate arrangement --truth scene/truth --out against-truth",
@@ -123,7 +124,7 @@ def test_no_command_compiles_anything_after_warm_up_all(ahead: Path, counted: Pa
         compiled.unlink(missing_ok=True)
     assert {command: names for command, names in found.items() if names} == {}
     for method in METHODS:
-        manifest = json.loads((tmp_path / method / "run.json").read_text())
+        manifest = json.loads((tmp_path / "compared" / "runs" / method / "run.json").read_text())
         assert manifest["counts"]["candidates"] > 0
         assert manifest["settings"]["general"]["method"] == method
 

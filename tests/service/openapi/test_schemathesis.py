@@ -1,7 +1,7 @@
 """The API against its own OpenAPI document: generated requests, valid and not, and every answer held against it.
 
 CI runs some hundred on each kind of database; `GABLEWORK_OPENAPI_CASES=10000 .venv/bin/python -m pytest -m slow
-tests/83_openapi -s` runs more.
+tests/service/openapi -s` runs more.
 """
 
 import base64

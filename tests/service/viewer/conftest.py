@@ -12,6 +12,7 @@ import httpx
 import pytest
 from checkout import ROOT
 from chromium import Visit
+from finished_jobs import finished_job
 from playwright.sync_api import Browser, Page, Playwright, expect, sync_playwright
 from processes import Program, free_port, missing, program
 from stocked_state import Stock, stock
@@ -34,9 +35,11 @@ SWITCHES = (
     "--disable-background-networking",
     "--disable-component-update",
     "--disable-sync",
-    # WebGL drawn by the processor
+    # WebGL drawn by the processor: only WebGL, and each pixel once
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
+    "--disable-gpu-compositing",
+    "--webgl-antialiasing-mode=none",
 )
 
 
@@ -94,7 +97,7 @@ def _served(folder: Path, *options: str, **variables: str) -> Iterator[str]:
             return False
 
     try:
-        served.wait_for(answers, "an answer")
+        served.wait_for(answers, "an answer", interval_s=0.1)
         yield url
     finally:
         served.end()
@@ -102,16 +105,35 @@ def _served(folder: Path, *options: str, **variables: str) -> Iterator[str]:
 
 
 @pytest.fixture(scope="module")
-def service_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of the service."""
-    return tmp_path_factory.mktemp("service")
-
-
-@pytest.fixture(scope="module")
-def service(built_page: Path, service_folder: Path) -> Iterator[str]:
+def service(built_page: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """URL of a service without keys, with a driver."""
-    with _served(service_folder, "--workers", "1") as url:
+    with _served(tmp_path_factory.mktemp("service"), "--workers", "1") as url:
         yield url
+
+
+@pytest.fixture(scope="package")
+def shared_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of the shared service."""
+    return tmp_path_factory.mktemp("shared")
+
+
+@pytest.fixture(scope="package")
+def shared_service(built_page: Path, shared_folder: Path) -> Iterator[str]:
+    """URL of a service without keys, with a driver, of whose jobs tests only look at the results."""
+    with _served(shared_folder, "--workers", "1") as url:
+        yield url
+
+
+@pytest.fixture(scope="package")
+def suburb_job(shared_service: str, tile: Path) -> str:
+    """Id of a finished job on houses of all roof types."""
+    return finished_job(shared_service, tile)
+
+
+@pytest.fixture(scope="package")
+def house_job(shared_service: str, house: Path) -> str:
+    """Id of a finished job on one gabled house, without points."""
+    return finished_job(shared_service, house)
 
 
 TILES = "https://tiles.example.org/"
@@ -119,11 +141,11 @@ TILES = "https://tiles.example.org/"
 
 
 @pytest.fixture
-def with_tiles(service: str, service_folder: Path) -> Iterator[str]:
+def with_tiles(shared_folder: Path, suburb_job: str) -> Iterator[str]:
     """URL of a second service on the same jobs, whose operator names tiles beneath the map."""
     template = f"{TILES}{{z}}/{{x}}/{{y}}.png"
     with _served(
-        service_folder, "--no-driver", GABLEWORK_MAP_TILES=template, GABLEWORK_MAP_CREDIT="© the owners"
+        shared_folder, "--no-driver", GABLEWORK_MAP_TILES=template, GABLEWORK_MAP_CREDIT="© the owners"
     ) as url:
         yield url
 
@@ -154,7 +176,7 @@ def driverless(built_page: Path, tmp_path: Path) -> Iterator[tuple[str, Path]]:
         yield url, tmp_path / "state"
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="package")
 def playwright() -> Iterator[Playwright]:
     """Playwright, started."""
     expect.set_options(timeout=PAGE_MS)
@@ -162,7 +184,7 @@ def playwright() -> Iterator[Playwright]:
         yield started
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="package")
 def browser(playwright: Playwright) -> Iterator[Browser]:
     """A Chromium with a profile of its own."""
     path = program("chromium")

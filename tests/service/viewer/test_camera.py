@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from chromium import Visit
-from finished_jobs import finished_job
 from numpy.typing import NDArray
 from playwright.sync_api import Route
 
@@ -19,12 +18,6 @@ SLOPE = 0.8
 """Slope of both sides of the ridge on which the tests put the suburb: its middle rises by 80 m."""
 EYE_M = 1.7
 """Least height of the camera above the ground, as in navigation.ts."""
-
-
-@pytest.fixture(scope="module")
-def finished(service: str, tile: Path) -> str:
-    """Id of a finished job."""
-    return finished_job(service, tile)
 
 
 def on_a_ridge(models: str) -> str:
@@ -40,16 +33,17 @@ def on_a_ridge(models: str) -> str:
 
 
 @pytest.fixture
-def hill(visit: Open, service: str, finished: str) -> Visit:
+def hill(visit: Open, shared_service: str, suburb_job: str) -> Visit:
     """The page with the models of a hilly city."""
-    opened = visit(service)
+    # a quarter of the pixels, which take most of the time: the tests look at shares of them
+    opened = visit(shared_service, device_scale_factor=0.5)
 
     def answer(route: Route) -> None:
         response = route.fetch()
         route.fulfill(response=response, body=on_a_ridge(response.text()))
 
     opened.page.route("**/results/cityjson", answer)
-    opened.open_job(finished)
+    opened.open_job(suburb_job)
     return opened
 
 
@@ -76,14 +70,14 @@ def test_zooming_in_with_the_wheel_ends_at_the_surface_under_the_pointer(hill: V
     box = hill.canvas.bounding_box()
     for x, y in ((0.5, 0.5), (0.3, 0.6), (0.7, 0.45)):
         hill.page.mouse.move(box["x"] + x * box["width"], box["y"] + y * box["height"])
-        for _ in range(60):
-            hill.page.mouse.wheel(0, -100)
+        for delta in (-100, -500) * 10:
+            hill.page.mouse.wheel(0, delta)
         seen = hill.pixels(tmp_path / f"wheel-{x}.png")
         assert eye_m(hill) > EYE_M - 0.01
         assert share_of_background(seen) < 0.5
         assert shades(seen) > 1
-        for _ in range(80):
-            hill.page.mouse.wheel(0, 100)
+        for delta in (100, 500) * 13:
+            hill.page.mouse.wheel(0, delta)
         seen = hill.pixels(tmp_path / f"out-{x}.png")
         assert share_of_background(seen) < 0.99
         hill.page.get_by_role("button", name="Fit").click()

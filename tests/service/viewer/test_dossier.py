@@ -7,7 +7,6 @@ from pathlib import Path
 import httpx
 import pytest
 from chromium import Visit
-from finished_jobs import finished_job
 from playwright.sync_api import expect
 
 pytestmark = [pytest.mark.slow]
@@ -16,19 +15,19 @@ Open = Callable[..., Visit]
 
 
 @pytest.fixture(scope="module")
-def building(service: str, house: Path) -> tuple[str, str]:
+def building(shared_service: str, house_job: str) -> tuple[str, str]:
     """A finished job, and its gabled house."""
-    job = finished_job(service, house)
-    (found,) = httpx.get(f"{service}jobs/{job}/buildings", params={"roof_type": "gable"}).json()["features"]
-    return job, found["id"]
+    buildings = f"{shared_service}jobs/{house_job}/buildings"
+    (found,) = httpx.get(buildings, params={"roof_type": "gable"}).json()["features"]
+    return house_job, found["id"]
 
 
 def test_a_record_leads_to_the_dossier_and_its_address_can_be_shared(
-    visit: Open, service: str, building: tuple[str, str]
+    visit: Open, shared_service: str, building: tuple[str, str]
 ) -> None:
     job, name = building
-    opened = visit(f"{service}#/jobs/{job}/buildings/{name}")
-    opened.url = service
+    opened = visit(f"{shared_service}#/jobs/{job}/buildings/{name}")
+    opened.url = shared_service
     opened.elsewhere.clear()
     page = opened.page
     opened.wait_for_models()
@@ -47,12 +46,13 @@ def test_a_record_leads_to_the_dossier_and_its_address_can_be_shared(
 
 
 def test_a_dossier_draws_the_model_and_says_what_decided(
-    visit: Open, service: str, building: tuple[str, str], tmp_path: Path
+    visit: Open, shared_service: str, building: tuple[str, str], tmp_path: Path
 ) -> None:
     job, name = building
-    decisions = httpx.get(f"{service}jobs/{job}/buildings/{name}/decisions").raise_for_status().json()["decisions"]
-    opened = visit(f"{service}#/jobs/{job}/buildings/{name}/dossier")
-    opened.url = service
+    answer = httpx.get(f"{shared_service}jobs/{job}/buildings/{name}/decisions").raise_for_status()
+    decisions = answer.json()["decisions"]
+    opened = visit(f"{shared_service}#/jobs/{job}/buildings/{name}/dossier")
+    opened.url = shared_service
     opened.elsewhere.clear()
     page = opened.page
     opened.wait_for_models()
@@ -85,15 +85,15 @@ def test_a_dossier_draws_the_model_and_says_what_decided(
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_a_dossier_fits_a_narrow_screen(
-    visit: Open, service: str, building: tuple[str, str], scheme: str, tmp_path: Path
+    visit: Open, shared_service: str, building: tuple[str, str], scheme: str, tmp_path: Path
 ) -> None:
     job, name = building
     opened = visit(
-        f"{service}#/jobs/{job}/buildings/{name}/dossier",
+        f"{shared_service}#/jobs/{job}/buildings/{name}/dossier",
         viewport={"width": 390, "height": 844},
         color_scheme=scheme,
     )
-    opened.url = service
+    opened.url = shared_service
     opened.elsewhere.clear()
     opened.wait_for_models()
     dossier = opened.page.get_by_role("dialog", name="Dossier")

@@ -18,29 +18,29 @@ pytestmark = [pytest.mark.slow]
 Open = Callable[..., Visit]
 
 
-def records_of(service: str, job: str) -> dict[str, dict[str, Any]]:
+def records_of(shared_service: str, job: str) -> dict[str, dict[str, Any]]:
     """The records of a job's buildings, by id."""
-    features = httpx.get(f"{service}jobs/{job}/buildings", params={"limit": 1000}).json()["features"]
+    features = httpx.get(f"{shared_service}jobs/{job}/buildings", params={"limit": 1000}).json()["features"]
     return {feature["id"]: feature["properties"] for feature in features}
 
 
 @pytest.fixture(scope="module")
-def job(service: str, tile: Path) -> str:
+def job(shared_service: str, suburb_job: str, tile: Path) -> str:
     """A job of which some models are doubtful: those that explain fewer of their points than the median."""
-    usual = records_of(service, finished_job(service, tile))
+    usual = records_of(shared_service, suburb_job)
     least = round(statistics.median(one["share_within_0_2m"] for one in usual.values()), 3)
-    return finished_job(service, tile, settings={"support": {"min_share_on_roof": least}})
+    return finished_job(shared_service, tile, settings={"support": {"min_share_on_roof": least}})
 
 
 def test_doubtful_models_come_first_and_say_why_with_figure_and_threshold(
-    visit: Open, service: str, job: str, tmp_path: Path
+    visit: Open, shared_service: str, job: str, tmp_path: Path
 ) -> None:
-    records = records_of(service, job)
+    records = records_of(shared_service, job)
     doubtful = {name for name, one in records.items() if one["status"] == "doubtful"}
     ok = {name for name, one in records.items() if one["status"] == "ok"}
     assert doubtful
     assert ok
-    opened = visit(service)
+    opened = visit(shared_service)
     opened.open_job(job)
     page = opened.page
     expect(page.locator(".result-title")).to_contain_text(f"{len(records)} buildings · {len(doubtful)} doubtful")
@@ -49,7 +49,7 @@ def test_doubtful_models_come_first_and_say_why_with_figure_and_threshold(
     expect(page.locator(".legend")).to_contain_text(f"Doubtful model {len(doubtful)}", use_inner_text=True)
 
     name = next(name for name in ids if name in doubtful)
-    page.goto(f"{service}#/jobs/{job}/buildings/{name}")
+    page.goto(f"{shared_service}#/jobs/{job}/buildings/{name}")
     detail = records[name]["reason_detail"]
     assert "of its roof returns lie within 0.2 m of the roof, less than" in detail
     expect(page.locator(".record")).to_contain_text(detail)
@@ -60,8 +60,8 @@ def test_doubtful_models_come_first_and_say_why_with_figure_and_threshold(
     page.screenshot(path=tmp_path / "dossier.png")
 
 
-def test_the_map_has_the_colours_of_the_legend(visit: Open, service: str, job: str, tmp_path: Path) -> None:
-    opened = visit(service)
+def test_the_map_has_the_colours_of_the_legend(visit: Open, shared_service: str, job: str, tmp_path: Path) -> None:
+    opened = visit(shared_service)
     opened.open_job(job)
     page = opened.page
     page.get_by_role("button", name="Map", exact=True).click()
@@ -74,9 +74,9 @@ def test_the_map_has_the_colours_of_the_legend(visit: Open, service: str, job: s
     assert len(set(pictures.values())) == len(pictures)
 
 
-def test_the_models_that_are_ok_are_downloaded_alone(visit: Open, service: str, job: str) -> None:
-    ok = {name for name, one in records_of(service, job).items() if one["status"] == "ok"}
-    opened = visit(service)
+def test_the_models_that_are_ok_are_downloaded_alone(visit: Open, shared_service: str, job: str) -> None:
+    ok = {name for name, one in records_of(shared_service, job).items() if one["status"] == "ok"}
+    opened = visit(shared_service)
     opened.open_job(job)
     page = opened.page
     page.locator(".menu summary", has_text="Download").click()

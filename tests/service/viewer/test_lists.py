@@ -13,7 +13,6 @@ import pyarrow.parquet as pq
 import pyproj
 import pytest
 from chromium import Visit, at_rest, of_hue
-from finished_jobs import finished_job
 from numpy.typing import NDArray
 from PIL import Image
 from playwright.sync_api import Locator, Page, Route, expect
@@ -34,22 +33,16 @@ MOST_ROWS = 60
 
 
 @pytest.fixture(scope="module")
-def finished(service: str, tile: Path) -> str:
-    """Id of a finished job."""
-    return finished_job(service, tile)
-
-
-@pytest.fixture(scope="module")
-def records(service: str, finished: str) -> dict[str, dict[str, Any]]:
+def records(shared_service: str, suburb_job: str) -> dict[str, dict[str, Any]]:
     """The records of its buildings, by id."""
-    features = httpx.get(f"{service}jobs/{finished}/buildings", params={"limit": 1000}).json()["features"]
+    features = httpx.get(f"{shared_service}jobs/{suburb_job}/buildings", params={"limit": 1000}).json()["features"]
     return {feature["id"]: feature["properties"] for feature in features}
 
 
 @pytest.fixture(scope="module")
-def left_out(service: str, finished: str) -> list[dict[str, Any]]:
+def left_out(shared_service: str, suburb_job: str) -> list[dict[str, Any]]:
     """The objects that it left out."""
-    table = httpx.get(f"{service}jobs/{finished}/results/rejected").raise_for_status().content
+    table = httpx.get(f"{shared_service}jobs/{suburb_job}/results/rejected").raise_for_status().content
     rows: list[dict[str, Any]] = pq.read_table(io.BytesIO(table)).to_pylist()
     assert rows, "the tile has no object to leave out"
     return rows
@@ -65,20 +58,20 @@ def tally(page: Page) -> Locator:
     return page.locator(".list-title .tally")
 
 
-def open_address(visit: Open, service: str, address: str, **options: object) -> Visit:
+def open_address(visit: Open, shared_service: str, address: str, **options: object) -> Visit:
     """A page at an address within a job, with its models."""
-    opened = visit(f"{service}#/jobs/{address}", **options)
-    opened.url = service
+    opened = visit(f"{shared_service}#/jobs/{address}", **options)
+    opened.url = shared_service
     opened.elsewhere.clear()
     opened.page.wait_for_selector("canvas[data-ready]", state="attached")
     return opened
 
 
 def test_search_order_and_filters_apply_to_list_and_view_and_a_link_brings_them_back(
-    visit: Open, service: str, finished: str, records: dict[str, dict[str, Any]], tmp_path: Path
+    visit: Open, shared_service: str, suburb_job: str, records: dict[str, dict[str, Any]], tmp_path: Path
 ) -> None:
-    opened = visit(service)
-    opened.open_job(finished)
+    opened = visit(shared_service)
+    opened.open_job(suburb_job)
     page = opened.page
     expect(tally(page)).to_have_text(str(len(records)))
     page.get_by_role("combobox", name="Sort by").select_option("height")
@@ -86,7 +79,7 @@ def test_search_order_and_filters_apply_to_list_and_view_and_a_link_brings_them_
     by_height = sorted(records, key=lambda name: (-(records[name]["height_m"] or 0.0), name))
     for place, name in enumerate(by_height[:5]):
         expect(listed(page).nth(place)).to_have_text(name)
-    expect(page).to_have_url(f"{service}#/jobs/{finished}?sort=-height")
+    expect(page).to_have_url(f"{shared_service}#/jobs/{suburb_job}?sort=-height")
 
     before = of_hue(opened.pixels(), "gable").sum()
     bound = float(np.median([record["height_m"] for record in records.values()]))
@@ -112,16 +105,16 @@ def test_search_order_and_filters_apply_to_list_and_view_and_a_link_brings_them_
     expect(page.locator("#legend-hip")).not_to_be_checked()
     page.get_by_role("button", name="Clear filters").click()
     expect(tally(page)).to_have_text(str(len(records)))
-    expect(page).to_have_url(f"{service}#/jobs/{finished}?sort=-height")
+    expect(page).to_have_url(f"{shared_service}#/jobs/{suburb_job}?sort=-height")
     page.get_by_label("Search ids and reasons").fill("no such building")
     expect(page.locator(".list-empty")).to_have_text("No object fits these filters.")
 
 
 def test_arrows_home_end_and_enter_lead_through_the_list(
-    visit: Open, service: str, finished: str, records: dict[str, dict[str, Any]]
+    visit: Open, shared_service: str, suburb_job: str, records: dict[str, dict[str, Any]]
 ) -> None:
-    opened = visit(service)
-    opened.open_job(finished)
+    opened = visit(shared_service)
+    opened.open_job(suburb_job)
     page = opened.page
     page.get_by_role("combobox", name="Sort by").select_option("id")
     ids = sorted(records)
@@ -155,10 +148,10 @@ def test_arrows_home_end_and_enter_lead_through_the_list(
 
 
 def test_what_was_left_out_is_listed_counted_and_drawn_with_its_reasons(
-    visit: Open, service: str, finished: str, left_out: list[dict[str, Any]], tmp_path: Path
+    visit: Open, shared_service: str, suburb_job: str, left_out: list[dict[str, Any]], tmp_path: Path
 ) -> None:
-    opened = visit(service)
-    opened.open_job(finished)
+    opened = visit(shared_service)
+    opened.open_job(suburb_job)
     page = opened.page
     models = int(page.locator("canvas").get_attribute("data-models") or 0)
     assert not any("results/rejected" in url for url in opened.urls), "it is loaded before it is wanted"
@@ -190,20 +183,20 @@ def test_what_was_left_out_is_listed_counted_and_drawn_with_its_reasons(
     expect(record.locator(".record-id")).to_have_text(chosen["object_id"])
 
     # a link without any filter finds it, too
-    other = open_address(visit, service, f"{finished}/buildings/{chosen['object_id']}")
+    other = open_address(visit, shared_service, f"{suburb_job}/buildings/{chosen['object_id']}")
     expect(other.page.locator(".record").get_by_role("heading", name="Not a building")).to_be_visible()
 
 
 def test_the_map_shares_selection_and_filters_and_loads_nothing_from_elsewhere(
-    visit: Open, service: str, finished: str, records: dict[str, dict[str, Any]], tmp_path: Path
+    visit: Open, shared_service: str, suburb_job: str, records: dict[str, dict[str, Any]], tmp_path: Path
 ) -> None:
-    opened = visit(service)
-    opened.open_job(finished)
+    opened = visit(shared_service)
+    opened.open_job(suburb_job)
     page = opened.page
     page.get_by_role("button", name="Map", exact=True).click()
     drawn = page.locator(".map-canvas")
     expect(drawn).to_have_attribute("data-outlines", str(len(records)))
-    expect(page).to_have_url(f"{service}#/jobs/{finished}?view=map")
+    expect(page).to_have_url(f"{shared_service}#/jobs/{suburb_job}?view=map")
     box = drawn.bounding_box()
     page.mouse.move(box["x"] + 300, box["y"] + 200)
     all_of_it = at_rest(drawn)
@@ -246,11 +239,11 @@ def test_the_map_shares_selection_and_filters_and_loads_nothing_from_elsewhere(
 
 
 def test_tiles_of_the_operator_lie_beneath_the_map_where_the_buildings_are(
-    visit: Open, with_tiles: str, finished: str, tmp_path: Path
+    visit: Open, with_tiles: str, suburb_job: str, tmp_path: Path
 ) -> None:
     picture = io.BytesIO()
     Image.new("RGB", (256, 256), MAGENTA).save(picture, "PNG")
-    opened = visit(f"{with_tiles}#/jobs/{finished}")
+    opened = visit(f"{with_tiles}#/jobs/{suburb_job}")
     opened.url = with_tiles
     opened.elsewhere.clear()
     page = opened.page
@@ -265,7 +258,7 @@ def test_tiles_of_the_operator_lie_beneath_the_map_where_the_buildings_are(
     assert all(address.startswith(TILES) for address in opened.elsewhere)
     asked = {tuple(map(int, re.findall(r"\d+", address.removeprefix(TILES)))) for address in opened.elsewhere}
     (level,) = {tile[0] for tile in asked}
-    features = httpx.get(f"{with_tiles}jobs/{finished}/buildings", params={"limit": 1000}).json()["features"]
+    features = httpx.get(f"{with_tiles}jobs/{suburb_job}/buildings", params={"limit": 1000}).json()["features"]
     to_mercator = pyproj.Transformer.from_crs("OGC:CRS84", "EPSG:3857", always_xy=True)
     for feature in features:
         x, y = to_mercator.transform(*feature["geometry"]["coordinates"][0][0])
@@ -281,8 +274,8 @@ def pixels_of(drawn: Locator, save_as: Path) -> NDArray[np.uint8]:
     return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB"))
 
 
-def test_two_fingers_zoom_the_map(visit: Open, service: str, finished: str) -> None:
-    opened = open_address(visit, service, f"{finished}?view=map", has_touch=True)
+def test_two_fingers_zoom_the_map(visit: Open, shared_service: str, suburb_job: str) -> None:
+    opened = open_address(visit, shared_service, f"{suburb_job}?view=map", has_touch=True)
     page = opened.page
     box = page.locator(".map-canvas").bounding_box()
     at_rest(page.locator(".map-canvas"))
@@ -302,9 +295,9 @@ def test_two_fingers_zoom_the_map(visit: Open, service: str, finished: str) -> N
     expect(page.locator(".record")).to_have_count(0)
 
 
-def test_with_reduced_motion_the_view_is_there_at_once(visit: Open, service: str, finished: str) -> None:
-    opened = visit(service, reduced_motion="reduce")
-    opened.open_job(finished)
+def test_with_reduced_motion_the_view_is_there_at_once(visit: Open, shared_service: str, suburb_job: str) -> None:
+    opened = visit(shared_service, reduced_motion="reduce")
+    opened.open_job(suburb_job)
     opened.pixels_at_rest()
     # every frame that the page asks for from now on
     opened.page.evaluate(
@@ -352,16 +345,16 @@ def made_up(models: str) -> str:
 
 
 def test_twenty_thousand_buildings_keep_few_rows_in_the_page(
-    visit: Open, service: str, finished: str, tmp_path: Path
+    visit: Open, shared_service: str, suburb_job: str, tmp_path: Path
 ) -> None:
-    opened = visit(service)
+    opened = visit(shared_service)
 
     def answer(route: Route) -> None:
         response = route.fetch()
         route.fulfill(response=response, body=made_up(response.text()))
 
     opened.page.route("**/results/cityjson", answer)
-    opened.open_job(finished)
+    opened.open_job(suburb_job)
     page = opened.page
     expect(tally(page)).to_have_text("20\u202f000")
     page.get_by_role("combobox", name="Sort by").select_option("height")
@@ -395,16 +388,16 @@ def test_twenty_thousand_buildings_keep_few_rows_in_the_page(
 @pytest.mark.parametrize("width", [390, 1000])
 def test_list_filters_and_map_fit_narrow_screens(
     visit: Open,
-    service: str,
-    finished: str,
+    shared_service: str,
+    suburb_job: str,
     records: dict[str, dict[str, Any]],
     left_out: list[dict[str, Any]],
     width: int,
     scheme: str,
     tmp_path: Path,
 ) -> None:
-    address = f"{finished}?sort=-residual&show=rejected&view=map"
-    opened = open_address(visit, service, address, viewport={"width": width, "height": 844}, color_scheme=scheme)
+    address = f"{suburb_job}?sort=-residual&show=rejected&view=map"
+    opened = open_address(visit, shared_service, address, viewport={"width": width, "height": 844}, color_scheme=scheme)
     page = opened.page
     page.locator("summary", has_text="Filters").click()
     expect(tally(page)).to_have_text(str(len(records) + len(left_out)))
@@ -418,13 +411,13 @@ def test_list_filters_and_map_fit_narrow_screens(
 
 
 def test_addresses_with_a_filter_name_the_same_job_and_building(
-    visit: Open, service: str, finished: str, records: dict[str, dict[str, Any]]
+    visit: Open, shared_service: str, suburb_job: str, records: dict[str, dict[str, Any]]
 ) -> None:
     chosen = sorted(records)[3]
-    opened = open_address(visit, service, f"{finished}/buildings/{chosen}?height=..100&q={chosen[:4]}")
+    opened = open_address(visit, shared_service, f"{suburb_job}/buildings/{chosen}?height=..100&q={chosen[:4]}")
     page = opened.page
     expect(page.locator(".record-id")).to_have_text(chosen)
-    expect(page.locator(f'.job[href="#/jobs/{finished}"]')).to_have_attribute("aria-current", re.compile("page|true"))
+    expect(page.locator(f'.job[href="#/jobs/{suburb_job}"]')).to_have_attribute("aria-current", re.compile("page|true"))
     page.get_by_role("button", name="All buildings").click()
     expect(listed(page).filter(has_text=chosen)).to_have_count(1)
-    expect(page).to_have_url(f"{service}#/jobs/{finished}?q={chosen[:4]}&height=..100")
+    expect(page).to_have_url(f"{shared_service}#/jobs/{suburb_job}?q={chosen[:4]}&height=..100")

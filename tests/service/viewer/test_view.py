@@ -26,15 +26,9 @@ SCRIPTS_BYTES = 250_000
 
 
 @pytest.fixture(scope="module")
-def gable(service: str, house: Path) -> str:
-    """Id of a finished job on one gabled house, without points."""
-    return finished_job(service, house)
-
-
-@pytest.fixture(scope="module")
-def with_points(service: str, house: Path) -> str:
+def with_points(shared_service: str, house: Path) -> str:
     """Id of a finished job on one gabled house, with points."""
-    return finished_job(service, house, points=True)
+    return finished_job(shared_service, house, points=True)
 
 
 def figures(opened: Visit) -> dict[str, float]:
@@ -62,15 +56,15 @@ def extremes(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
     return [(int(columns[i]), int(rows[i])) for i in picks]
 
 
-def test_colours_of_roofs_are_chosen_and_explained(visit: Open, service: str, gable: str) -> None:
-    opened = visit(service)
-    opened.open_job(gable)
+def test_colours_of_roofs_are_chosen_and_explained(visit: Open, shared_service: str, house_job: str) -> None:
+    opened = visit(shared_service)
+    opened.open_job(house_job)
     page = opened.page
     choice = page.get_by_label("Colour", exact=True)
     page.get_by_role("button", name="Top").click()  # both planes are seen from there
     typed = opened.pixels_at_rest()
     assert of_hue(typed, "gable").any()
-    record = httpx.get(f"{service}jobs/{gable}/buildings").json()["features"][0]["properties"]
+    record = httpx.get(f"{shared_service}jobs/{house_job}/buildings").json()["features"][0]["properties"]
     classes = page.get_by_role("list", name="Colours")
 
     choice.select_option("Residual")
@@ -96,9 +90,9 @@ def test_colours_of_roofs_are_chosen_and_explained(visit: Open, service: str, ga
     assert (opened.pixels() == typed).all()
 
 
-def test_the_ground_is_switched_off_and_on(visit: Open, service: str, gable: str) -> None:
-    opened = visit(service)
-    opened.open_job(gable)
+def test_the_ground_is_switched_off_and_on(visit: Open, shared_service: str, house_job: str) -> None:
+    opened = visit(shared_service)
+    opened.open_job(house_job)
     ground = opened.page.get_by_role("button", name="Ground")
     expect(ground).to_have_attribute("aria-pressed", "true")
     before = opened.pixels_at_rest()
@@ -114,14 +108,14 @@ def test_the_ground_is_switched_off_and_on(visit: Open, service: str, gable: str
 
 
 def test_two_clicks_on_the_corners_of_a_roof_measure_its_sides(
-    visit: Open, service: str, gable: str, tmp_path: Path
+    visit: Open, shared_service: str, house_job: str, tmp_path: Path
 ) -> None:
     params = {"crs": "native"}
-    feature = httpx.get(f"{service}jobs/{gable}/buildings", params=params).json()["features"][0]
+    feature = httpx.get(f"{shared_service}jobs/{house_job}/buildings", params=params).json()["features"][0]
     rectangle = np.array(shape(feature["geometry"]).minimum_rotated_rectangle.exterior.coords)
     sides = np.sort(np.hypot(*np.diff(rectangle, axis=0).T))
-    opened = visit(service)
-    opened.open_job(gable)
+    opened = visit(shared_service)
+    opened.open_job(house_job)
     opened.page.get_by_role("button", name="Top").click()
     opened.pixels_at_rest()
     for _ in range(4):
@@ -140,16 +134,16 @@ def test_two_clicks_on_the_corners_of_a_roof_measure_its_sides(
     opened.page.screenshot(path=tmp_path / "measured.png")
     # a corner of the model is taken if the click is near it, so the distances are those of the model
     assert np.sort(measured) == pytest.approx(sides, abs=0.05)
-    assert opened.page.url.endswith(gable), "a click of the tool has opened a record"
+    assert opened.page.url.endswith(house_job), "a click of the tool has opened a record"
     opened.page.get_by_role("button", name="Measure").click()
     expect(opened.page.get_by_role("region", name="Measurement")).to_be_hidden()
 
 
-def test_measuring_needs_no_pointer(visit: Open, service: str, gable: str) -> None:
-    name = httpx.get(f"{service}jobs/{gable}/buildings").json()["features"][0]["id"]
-    opened = visit(service)
+def test_measuring_needs_no_pointer(visit: Open, shared_service: str, house_job: str) -> None:
+    name = httpx.get(f"{shared_service}jobs/{house_job}/buildings").json()["features"][0]["id"]
+    opened = visit(shared_service)
     page = opened.page
-    page.goto(f"{service}#/jobs/{gable}/buildings/{name}")
+    page.goto(f"{shared_service}#/jobs/{house_job}/buildings/{name}")
     opened.wait_for_models()
     opened.pixels_at_rest()
     button, canvas = page.get_by_role("button", name="Measure"), opened.canvas
@@ -189,9 +183,9 @@ def test_measuring_needs_no_pointer(visit: Open, service: str, gable: str) -> No
     expect(page.locator(".record-id")).to_have_count(0)
 
 
-def test_a_tap_measures_too(visit: Open, service: str, gable: str) -> None:
-    opened = visit(service, viewport={"width": 390, "height": 844}, has_touch=True)
-    opened.open_job(gable)
+def test_a_tap_measures_too(visit: Open, shared_service: str, house_job: str) -> None:
+    opened = visit(shared_service, viewport={"width": 390, "height": 844}, has_touch=True)
+    opened.open_job(house_job)
     opened.page.get_by_role("button", name="Measure").tap()
     box = opened.canvas.bounding_box()
     for share in (0.4, 0.6):
@@ -204,10 +198,10 @@ def points_button(opened: Visit) -> Locator:
 
 
 def test_points_are_shown_over_the_models_coloured_and_hidden_by_class(
-    visit: Open, service: str, with_points: str, tmp_path: Path
+    visit: Open, shared_service: str, with_points: str, tmp_path: Path
 ) -> None:
-    tileset: dict[str, Any] = httpx.get(f"{service}jobs/{with_points}/points/tileset.json").json()
-    opened = visit(service)
+    tileset: dict[str, Any] = httpx.get(f"{shared_service}jobs/{with_points}/points/tileset.json").json()
+    opened = visit(shared_service)
     opened.open_job(with_points)
     page = opened.page
     models = opened.pixels_at_rest()
@@ -239,17 +233,17 @@ def test_points_are_shown_over_the_models_coloured_and_hidden_by_class(
     assert (opened.pixels_at_rest() != models).any(axis=2).mean() < 0.001
 
 
-def test_a_job_without_points_offers_none(visit: Open, service: str, gable: str) -> None:
-    opened = visit(service)
-    opened.open_job(gable)
+def test_a_job_without_points_offers_none(visit: Open, shared_service: str, house_job: str) -> None:
+    opened = visit(shared_service)
+    opened.open_job(house_job)
     expect(opened.page.get_by_role("button", name="Measure")).to_be_visible()
     expect(points_button(opened)).to_have_count(0)
 
 
 def test_points_that_cannot_be_read_are_reported_and_asked_for_again(
-    visit: Open, service: str, with_points: str
+    visit: Open, shared_service: str, with_points: str
 ) -> None:
-    opened = visit(service)
+    opened = visit(shared_service)
     opened.expect_error("status of 503")
     opened.open_job(with_points)
     opened.page.route("**/points/**/*.glb", lambda route: route.fulfill(status=503))
@@ -264,9 +258,9 @@ def test_points_that_cannot_be_read_are_reported_and_asked_for_again(
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_tools_and_legends_fit_on_a_phone(
-    visit: Open, service: str, with_points: str, scheme: str, tmp_path: Path
+    visit: Open, shared_service: str, with_points: str, scheme: str, tmp_path: Path
 ) -> None:
-    opened = visit(service, viewport={"width": 390, "height": 844}, color_scheme=scheme)
+    opened = visit(shared_service, viewport={"width": 390, "height": 844}, color_scheme=scheme)
     opened.open_job(with_points)
     points_button(opened).click()
     shown_points(opened)
@@ -284,10 +278,10 @@ def test_tools_and_legends_fit_on_a_phone(
         assert box["y"] + box["height"] <= stage["y"] + stage["height"]
 
 
-def test_few_scripts_are_loaded_before_the_first_picture(visit: Open, service: str, gable: str) -> None:
+def test_few_scripts_are_loaded_before_the_first_picture(visit: Open, shared_service: str, house_job: str) -> None:
     opened = visit("about:blank")
-    opened.url = service
-    opened.page.goto(f"{service}#/jobs/{gable}")
+    opened.url = shared_service
+    opened.page.goto(f"{shared_service}#/jobs/{house_job}")
     opened.wait_for_models()
     scripts = {url for url in opened.urls if url.endswith(".js")}
     sizes = {url.rsplit("/", 1)[1]: len(gzip.compress(httpx.get(url).content, 9)) for url in scripts}
