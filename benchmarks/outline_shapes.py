@@ -29,7 +29,6 @@ from typing import Any
 
 import numpy as np
 import shapely
-from scipy.optimize import linear_sum_assignment
 
 from benchmarks.entries import Entry, markdown_table
 from benchmarks.survey_runs import ROOT, run_survey
@@ -37,6 +36,7 @@ from pipeline.export.geoparquet import read_table
 from pipeline.extras.compare.compare import Variant
 from pipeline.model import FloatArray
 from pipeline.ruler.evaluation.reading import read_models
+from pipeline.ruler.evaluation.wireframe_scores import matched_corners
 from pipeline.ruler.simulation.dataset import simulate
 from pipeline.ruler.simulation.outline_shapes import CELLS, SIGMA_PER_M2, SPACINGS_M
 from pipeline.ruler.simulation.seeds import seed_of
@@ -102,13 +102,6 @@ def corners_of(outline: shapely.Geometry) -> FloatArray:
     return np.concatenate(found)
 
 
-def paired(some: FloatArray, others: FloatArray, tolerance_m: float) -> int:
-    """How many of places (n, 2) and (m, 2) can be assigned one to one within the tolerance."""
-    distance = np.hypot(*(some[:, None] - others).transpose(2, 0, 1))
-    chosen = linear_sum_assignment(np.where(distance <= tolerance_m, distance, 1e3))
-    return int((distance[chosen] <= tolerance_m).sum())
-
-
 def closed(outlines: Iterable[shapely.Geometry]) -> shapely.Geometry:
     """Areas as one, without the small gaps between them."""
     wide = shapely.union_all(shapely.buffer(list(outlines), GAP_M, join_style="mitre"))
@@ -140,7 +133,7 @@ def judged(
     corners = corners_of(found), corners_of(true)
     return Judged(
         iou=shapely.area(shapely.intersection(found, true)) / shapely.area(shapely.union(found, true)),
-        right=paired(*corners, max(0.5, 0.7 * spacing_m)),
+        right=int(matched_corners(*corners, max(0.5, 0.7 * spacing_m))[0].sum()),
         found=len(corners[0]),
         true=len(corners[1]),
         angle_deg=float(np.average(angle[has], weights=np.array(weights)[has])) if has.any() else NAN,
@@ -188,7 +181,7 @@ def grouped(rows: Sequence[Judged], key: Callable[[Judged], Any]) -> list[tuple[
     return [(value, list(some)) for value, some in itertools.groupby(sorted(rows, key=key), key)]
 
 
-def cell(value: float, form: str = ".3f") -> str:
+def cell(value: float | np.floating[Any], form: str = ".3f") -> str:
     """A figure; empty for nan."""
     return "" if math.isnan(value) else f"{value:{form}}"
 

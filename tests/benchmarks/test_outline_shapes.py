@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import shapely
 
-from benchmarks.outline_shapes import Judged, corners_of, judged, paired, shape_table, sigma_cells
+from benchmarks.outline_shapes import Judged, corners_of, judged, shape_table, sigma_cells
 
 HOUSE = shapely.box(0.0, 0.0, 10.0, 6.0)
 
@@ -48,13 +48,12 @@ def test_a_turned_outline_has_its_angle_and_no_short_edges_are_judged() -> None:
     assert judged(shapely.box(0, 0, 1.9, 1.9), [HOUSE], [math.nan], per_m2=4.0).edges == ()
 
 
-def test_corners_are_paired_one_to_one() -> None:
-    places = corners_of(HOUSE)
-    assert len(places) == 4
-    assert paired(places, places + 0.3, 0.5) == 4
-    assert paired(np.concatenate([places, places]), places, 0.5) == 4
-    assert paired(np.zeros((0, 2)), places, 0.5) == 0
+def test_corners_turn_by_more_than_ten_degrees_and_are_paired_one_to_one() -> None:
+    assert len(corners_of(HOUSE)) == 4
     assert len(corners_of(shapely.Point(0.0, 0.0).buffer(5.0, quad_segs=12))) == 0
+    notched = shapely.difference(HOUSE, shapely.box(0.0, 0.0, 0.2, 0.2))
+    found = judged(HOUSE, [notched], [math.nan], per_m2=4.0)
+    assert (found.right, found.found, found.true) == (4, 6, 4)
 
 
 def test_changes_are_those_of_buildings_that_both_found() -> None:
