@@ -108,7 +108,7 @@ class RoofSettings(Parameters):
         True, "Whether the outline is drawn with straight lines where no footprint is given."
     )
     outline_noise_spacings: float = parameter(
-        0.4,
+        0.35,
         "Standard deviation of the raw outline about its edges: with less, the outline gets more edges.",
         unit="point spacings",
         minimum=0.05,
@@ -116,7 +116,8 @@ class RoofSettings(Parameters):
     )
     min_outline_noise_m: float = parameter(
         0.25,
-        "The same at least, where points are dense: gutters, plants and lost pulses make an eave as ragged.",
+        "The same at least, where points are dense: gutters, plants and lost pulses make an eave as ragged. Small houses"
+        " show finer edges.",
         unit="m",
         minimum=0.02,
         maximum=2.0,

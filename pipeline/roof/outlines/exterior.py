@@ -52,6 +52,8 @@ _LEAST_PEAK = 0.05
 """Least weight of a direction that is tried, as a share of that of the first."""
 _TRIED = 5
 """Most directions that are tried."""
+_NOISE_OF_SIZE = 0.035
+"""The least noise is no more than this share of the root of the area: small houses show finer edges."""
 _LEAST_SPACINGS, _LEAST_M = 0.75, 0.3
 """Shorter edges are left out: in point spacings, and at least."""
 _MOVED = 1.2
@@ -113,7 +115,8 @@ def _straight_rings(
     """The rings of one part with straight edges; a ring that cannot be drawn so stays raw."""
     borders = _rings(polygon)
     drawn: list[FloatArray | None] = [None] * len(borders)
-    noise_mm = max(settings.outline_noise_spacings * spacing_m, settings.min_outline_noise_m) * 1e3
+    least_mm = min(max(_NOISE_OF_SIZE * math.sqrt(polygon.area), 100.0), settings.min_outline_noise_m * 1e3)
+    noise_mm = max(settings.outline_noise_spacings * spacing_m * 1e3, least_mm)
     if points is not None and are_few(len(points.xy_mm), spacing_m):
         drawn[0] = _of_few_points(borders[0], spacing_m, points, noise_mm)
     for factor in _FACTORS:

@@ -19,7 +19,7 @@ from pipeline.roof.lines import Run
 
 MOST_POINTS = 150
 """More points show directions well."""
-_LEAST_SPACING_M = 1.0
+_LEAST_SPACING_M = 2.0
 """As do points that lie closer."""
 _OFF_MM = 120.0
 """Standard deviation of a point about the edge that it lies outside of."""
