@@ -24,6 +24,7 @@ from pipeline.roof.edge_position import EdgePoints, mixed_pulse_reach_mm, outwar
 from pipeline.roof.footprint import polygons_of
 from pipeline.roof.lines import Point, Run, corners, crossing, fitted_run, projected
 from pipeline.roof.outlines.description import FREE, Prices, least_description
+from pipeline.roof.outlines.few_points import are_few, directions, envelope_mm, likeliest
 from pipeline.roof.roof_settings import RoofSettings
 from pipeline.roof.snapped_rings import differ_by_more, on_grid, snapped_ring
 
@@ -115,6 +116,8 @@ def _straight_rings(
     borders = _rings(polygon)
     drawn: list[FloatArray | None] = [None] * len(borders)
     tolerance = max(settings.eave_tolerance_spacings * spacing_m, settings.min_eave_tolerance_m) * 1e3
+    if points is not None and are_few(len(points.xy_mm), spacing_m):
+        drawn[0] = _of_few_points(borders[0], spacing_m, points, tolerance)
     for factor in _FACTORS:
         noise_mm = factor * max(_NOISE_SPACINGS * spacing_m, _NOISE_M) * 1e3
         rings = [_with_breaks(border, _BREAK_SPACINGS * spacing_m * 1e3) for border in borders]
@@ -129,6 +132,34 @@ def _straight_rings(
         if all(ring is not None for ring in drawn):
             break
     return [raw if ring is None else ring for raw, ring in zip(borders, drawn, strict=True)]
+
+
+def _of_few_points(border: FloatArray, spacing_m: float, points: EdgePoints, tolerance: float) -> FloatArray | None:
+    """The likeliest ring around few points: as described, or in two directions of any."""
+    xy_mm = points.xy_mm.astype(np.float64)
+    near = shapely.contains_xy(shapely.buffer(Polygon(border), 1e3 * spacing_m), xy_mm)
+    xy_mm = xy_mm[near]
+    noise_mm = max(_NOISE_SPACINGS * spacing_m, _NOISE_M) * 1e3
+    ring = _with_breaks(border, _BREAK_SPACINGS * spacing_m * 1e3)
+    area_mm2 = Polygon(border).area
+    ((own_border, own),) = described([ring], 1e3 * spacing_m, noise_mm)
+    per_mm = 0.5 / (1e3 * spacing_m * noise_mm * noise_mm)
+    ways = [(own_border, own)]
+    for angle in directions().tolist():
+        ways.append((border, _runs(ring, pairs_of([angle]), per_mm, PRICES._replace(free=PRICES.sharp))[0]))
+    drawings: list[tuple[float, FloatArray]] = []
+    least = max(_LEAST_SPACINGS * spacing_m, _LEAST_M) * 1e3
+    for along, runs in ways:
+        for run in runs:
+            shift = envelope_mm(run, xy_mm, area_mm2, 1.5e3 * spacing_m)
+            run.x += shift * math.sin(run.direction)
+            run.y -= shift * math.cos(run.direction)
+        found = _ring_of(along, runs, least, 4.0 * tolerance) if len(runs) >= _FEWEST else None
+        if found is not None:
+            free = sum(not run.exact for run in runs)
+            cost = PRICES.edge * len(found) + PRICES.free * free
+            drawings.append((cost, found))
+    return likeliest(drawings, xy_mm, spacing_m)
 
 
 def described(rings: Sequence[_Ring], spacing_mm: float, noise_mm: float) -> list[tuple[FloatArray, list[Run]]]:

@@ -1,0 +1,75 @@
+"""Outlines around few points: where points lie far apart, their ring says little about directions, the points more.
+
+Points of a roof lie anywhere in its outline, and none outside. So among outlines in all directions that one is most
+likely whose area is least, at n ln(area) nats for n points, where points that it leaves outside cost what their
+distance is worth, and edges what they cost in a description.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+
+import numpy as np
+import shapely
+from shapely import Polygon
+
+from pipeline.model import FloatArray
+from pipeline.roof.lines import Run
+
+MOST_POINTS = 150
+"""More points show directions well."""
+_LEAST_SPACING_M = 1.0
+"""As do points that lie closer."""
+_OFF_MM = 120.0
+"""Standard deviation of a point about the edge that it lies outside of."""
+_MOST = 8.0
+"""Most that a point outside costs, nats: it may be no roof."""
+_STEP = math.radians(5.0)
+"""Between the directions that are tried."""
+
+
+def are_few(n_points: int, spacing_m: float) -> bool:
+    """Whether outlines around some points are compared in all directions."""
+    return n_points <= MOST_POINTS and spacing_m >= _LEAST_SPACING_M
+
+
+def directions() -> FloatArray:
+    """The directions that are tried, modulo a right angle, radians."""
+    return np.arange(0.0, 0.5 * math.pi, _STEP)
+
+
+def envelope_mm(run: Run, xy_mm: FloatArray, area_mm2: float, out_mm: float) -> float:
+    """How far to the right a line lies best along its stretch: millimetres, from points (n, 2) to its left and right.
+
+    Moving it outwards costs area, n ln(area) in all; a point that it leaves outside costs its squared distance.
+    """
+    ux, uy = math.cos(run.direction), math.sin(run.direction)
+    dx, dy = xy_mm[:, 0] - run.x, xy_mm[:, 1] - run.y
+    off, along = dx * uy - dy * ux, dx * ux + dy * uy
+    beside = np.sort(off[(np.abs(along) <= 0.5 * run.length) & (np.abs(off) <= out_mm)])[::-1]
+    if len(beside) == 0:
+        return 0.0
+    a_mm = len(xy_mm) * run.length / area_mm2
+    beyond = np.maximum(beside[:, None] - beside[None, :], 0.0)
+    outside = np.minimum(0.5 * (beyond / _OFF_MM) ** 2, _MOST).sum(axis=0)
+    # the edge lies beyond its outermost point by the mean way to the next one
+    return float(beside[np.argmin(a_mm * beside + outside)]) + min(1.0 / a_mm, 0.5 * out_mm)
+
+
+def likeliest(
+    drawings: Iterable[tuple[float, FloatArray]], xy_mm: FloatArray, spacing_m: float
+) -> FloatArray | None:
+    """The ring of least cost among some with the cost of their edges; points (n, 2); None where there are none."""
+    best, least = None, math.inf
+    places = shapely.points(xy_mm)
+    for cost, ring in drawings:
+        polygon = Polygon(ring)
+        if not polygon.is_valid or polygon.area <= 0.0:
+            continue
+        off = shapely.distance(places, polygon)
+        total = cost + len(xy_mm) * math.log(polygon.area / (1e3 * spacing_m) ** 2)
+        total += float(np.minimum(0.5 * (off / _OFF_MM) ** 2, _MOST).sum())
+        if total < least:
+            best, least = ring, total
+    return best
