@@ -185,7 +185,7 @@ def _without_needles(polygon: Polygon) -> list[Polygon]:
 
 def _is_needle(part: Polygon) -> bool:
     """Whether a part that an opening removes is more than a film along an edge or a cut corner."""
-    return part.area > 0.5 * _NEEDLE_MM * _NEEDLE_MM and 2.0 * part.area > 0.1 * _NEEDLE_MM * part.length
+    return bool(part.area > 0.5 * _NEEDLE_MM * _NEEDLE_MM and 2.0 * part.area > 0.1 * _NEEDLE_MM * part.length)
 
 
 def _without_short_edges(polygon: Polygon) -> Polygon:
