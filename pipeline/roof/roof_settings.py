@@ -116,8 +116,8 @@ class RoofSettings(Parameters):
     )
     min_outline_noise_m: float = parameter(
         0.25,
-        "The same at least, where points are dense: gutters, plants and lost pulses make an eave as ragged. Small houses"
-        " show finer edges.",
+        "The same at least, where points are dense: gutters and plants make an eave as ragged. Small houses show finer"
+        " edges.",
         unit="m",
         minimum=0.02,
         maximum=2.0,

@@ -197,7 +197,16 @@ def least_description(
         live[kept] = j
         alive = kept + 1
     state = int(np.argmin(best[m - 1]))
-    cost = best[m - 1, state]
+    ends, of_edge, along_edge = _traced_back(start, came, angles, state)
+    return ends, of_edge, along_edge, best[m - 1, state]
+
+
+@kernel(inline="always")
+def _traced_back(
+    start: IntArray, came: IntArray, angles: FloatArray, state: int
+) -> tuple[IntArray, IntArray, FloatArray]:
+    """The ends of the edges of the best description, the direction of each and its angle, from the last one back."""
+    m, free = len(start), start.shape[1] - 1
     ends, of_edge, along_edge = np.empty(m, np.int64), np.empty(m, np.int64), np.empty(m)
     count, j = 0, m - 1
     while j > 0 and state >= 0:
@@ -205,4 +214,4 @@ def least_description(
         j, state = start[j, state], came[j, state]
         count += 1
     ends[count] = 0
-    return ends[count::-1].copy(), of_edge[:count][::-1].copy(), along_edge[:count][::-1].copy(), cost
+    return ends[count::-1].copy(), of_edge[:count][::-1].copy(), along_edge[:count][::-1].copy()
