@@ -110,7 +110,15 @@ def _reconstruct(
             plan = partition_roof(roof, segmentation.planes, settings.roof)
             forms = traced_forms(plan, roof, settings.roof)
         model, codes = first_valid(
-            (dataclasses.replace(form, draw=partial(own_model, building, segmentation, roof, form)) for form in forms),
+            (
+                NamedForm(
+                    form.name,
+                    partial(own_model, building, segmentation, roof, form),
+                    form.detail,
+                    is_last_resort=form.is_last_resort,
+                )
+                for form in forms
+            ),
             building,
         )
         if model is not None:

@@ -27,7 +27,7 @@ import numba
 from numba.core import cgutils, codegen, compiler, config, event, registry, serialize, sigutils
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.environment import Environment, _rebuild_env
-from numba.core.runtime import _nrt_python
+from numba.core.runtime import _nrt_python, rtsys
 from numba.core.targetconfig import ConfigStack
 from numba.core.typing import templates
 
@@ -415,6 +415,8 @@ class KernelDispatcher(registry.CPUDispatcher):
         library.enable_object_caching()
         context.create_cpython_wrapper(library, known.fndesc, known.environment, None, release_gil=True)
         library.add_linking_library(known.library)
+        # the wrapper releases arrays: without the code for that it runs only where something else brought it
+        library.add_linking_library(rtsys.library)
         entry = context.get_executable(library, known.fndesc, known.environment)
         # numba finds a compiled function by its C function, which has changed
         self.targetctx.insert_user_function(entry, known.fndesc, [library])

@@ -27,7 +27,7 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 LIST = "kernels.json"
 """File beside the kernels of a package or an image: the sha256 of each, by file name."""
 _HEADER = struct.Struct("<8s32sQQQ")
-_MAGIC = b"gwkern02"
+_MAGIC = b"gwkern03"
 _LOCKS = "locks"
 _LOCK_RANGE = 2**30
 

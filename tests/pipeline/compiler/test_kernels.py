@@ -269,6 +269,22 @@ def test_a_kernel_with_a_damaged_file_is_compiled_again(sources: Sources, damage
     assert path.read_bytes() != b""
 
 
+def test_a_loaded_kernel_may_be_the_first_of_a_process(sources: Sources) -> None:
+    # a wrapper that is made after its kernel needs the code that releases arrays, too
+    fitted = "fitted_run(np.array([[0.0, 0.0], [3.0, 4.0]]), 0, 1).length"
+    sources.write(
+        end="""
+from pipeline.roof.lines import _fit
+
+@kernel
+def chord(border):
+    return _fit(border, 0, 1)[3]
+"""
+    )
+    sources.run(f"from pipeline.roof.lines import fitted_run; callee.chord(np.zeros((2, 2)));result = {fitted}")
+    assert sources.run(f"from pipeline.roof.lines import fitted_run; result = {fitted}")[0] == 5.0
+
+
 @pytest.mark.slow
 def test_plain_numba_computes_the_same_and_stores_its_own_files(sources: Sources) -> None:
     words = f"result = [caller.total({VALUES}), caller.halves({VALUES})[1], callee.scaled(2.0)]"
