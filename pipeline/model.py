@@ -416,6 +416,8 @@ class ModelQuality:
     """Diameter of the largest circle on the roof that holds no point, in plan, metres."""
     ridge_z_sigma_m: float = math.nan
     """Standard deviation of the highest roof point, metres, without what a whole strip is off by; nan for a block."""
+    outline_sigma_m: float = math.nan
+    """Standard deviation in plan of the edges of the outline, metres; nan if it was given."""
     bic_margin: float = math.nan
     """By how much the information criterion of the chosen form is below the next one's; nan where none competed."""
     is_curved: bool = False

@@ -23,7 +23,7 @@ from pipeline.model import (
     RoofFace,
     Status,
 )
-from pipeline.quality.model_quality import DRAWN_OUTLINE_SPACINGS, model_quality
+from pipeline.quality.model_quality import drawn_outline_sigma_m, model_quality
 from pipeline.quality.validity import check_solid
 from pipeline.registry import extra
 from pipeline.roof.footprint import hull_of_points
@@ -60,7 +60,7 @@ def record_of(
         planes,
         solids,
         spacing_m=roof.spacing_m,
-        outline_sigma_m=0.0 if candidate.footprint is not None else roof.spacing_m * DRAWN_OUTLINE_SPACINGS,
+        outline_sigma_m=0.0 if candidate.footprint is not None else drawn_outline_sigma_m(roof.spacing_m),
         is_planar=model.lod == "2.2",
         bic_margin=model.bic_margin,
     )

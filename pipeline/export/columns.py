@@ -271,6 +271,13 @@ BUILDINGS = (
         page="records.md#uncertainty-of-the-ridge",
     ),
     Column(
+        "outline_sigma_m",
+        FLOAT64,
+        "m",
+        "standard deviation of the place of the outline's edges, across their direction; null if the outline was given",
+        page="records.md#uncertainty-of-the-outline",
+    ),
+    Column(
         "bic_margin",
         FLOAT64,
         NONE,
@@ -396,6 +403,7 @@ SHOWN: Mapping[str, Mapping[str, tuple[str, int]]] = {
         "footprint_share": ("Given footprint covered", 1),
         "noise_m": ("Noise of the points", 3),
         "ridge_z_sigma_m": ("Ridge uncertainty (one sigma)", 3),
+        "outline_sigma_m": ("Outline uncertainty (one sigma)", 3),
         "unexplained_m2": ("Roof unexplained by points", 1),
         "extrapolated_share": ("Roof that was not seen", 1),
         "largest_hole_m": ("Largest hole in the points", 1),

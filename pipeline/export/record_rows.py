@@ -135,6 +135,7 @@ def _quality(quality: ModelQuality) -> dict[str, float | bool | None]:
         "extrapolated_share": _or_none(quality.extrapolated_share, 4),
         "largest_hole_m": _or_none(quality.largest_hole_m),
         "ridge_z_sigma_m": _or_none(quality.ridge_z_sigma_m),
+        "outline_sigma_m": _or_none(quality.outline_sigma_m),
         "bic_margin": _or_none(quality.bic_margin),
         "is_curved": quality.is_curved,
     }

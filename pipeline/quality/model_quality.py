@@ -21,12 +21,21 @@ GAP_SPACINGS = 1.5
 """A place farther than this from all points is seen by none: of points strewn at random one place in a thousand is."""
 EXTRAPOLATED_SPACINGS = 2.0
 """A part of the roof farther than this from all points was drawn by what lies beside it, and by the footprint."""
-DRAWN_OUTLINE_SPACINGS = 0.2
-"""Standard deviation in plan of a drawn outline: pent roofs of the simulated suites, whose ridge is their outline."""
+_OUTLINE_PER_SPACING, _LEAST_OUTLINE_M = 0.2, 0.02
+"""Standard deviation of drawn outlines: of the suite `outline_shapes` (dev), 0.3 to 8 points per m2."""
 _MIN_CELL_M = 0.25
 """Places on the roof are looked at on a raster of one point spacing, or of this where points are denser."""
 _MAX_CELLS = 20_000
 """Halls of more cells are looked at more coarsely."""
+
+
+def drawn_outline_sigma_m(spacing_m: float) -> float:
+    """Standard deviation in plan of the edges of a drawn outline, metres: it grows with the area per point.
+
+    >>> [round(drawn_outline_sigma_m(density**-0.5), 2) for density in (0.3, 1.5, 8.0)]
+    [0.67, 0.13, 0.03]
+    """
+    return math.hypot(_OUTLINE_PER_SPACING * spacing_m**2, _LEAST_OUTLINE_M)
 
 
 def model_quality(
@@ -72,6 +81,7 @@ def model_quality(
         extrapolated_share=extrapolated,
         largest_hole_m=hole,
         ridge_z_sigma_m=sigma,
+        outline_sigma_m=outline_sigma_m if outline_sigma_m > 0.0 else math.nan,
         bic_margin=bic_margin,
         is_curved=is_planar and is_curved_roof(planes, faces, solids),
     )

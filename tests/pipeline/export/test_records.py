@@ -29,7 +29,7 @@ solid_lod13, solid_lod13_parts, solid_lod13_surfaces, solid_lod23, solid_lod23_p
 solid_lod23_planes, ground_z, ground_source, eave_z, ridge_z, h_min, h_50p, h_70p, h_max, height_m, height_source,
 footprint_area_m2, footprint_share, roof_area_m2, volume_m3, n_points, density_per_m2, through_share,
 detection_confidence, n_planes, rmse_m, p95_m, coverage, point_spacing_m, noise_m, share_within_0_2m, share_below_roof,
-unexplained_m2, extrapolated_share, largest_hole_m, ridge_z_sigma_m, bic_margin,
+unexplained_m2, extrapolated_share, largest_hole_m, ridge_z_sigma_m, outline_sigma_m, bic_margin,
 is_curved, valid, validity_codes, touches_data_edge, strip_offset_m, ground_noise_m, wall_outline, overhang_m,
 overhang_sigma_m, overhang_source, lod23_reason, guides_followed, guides_not_followed, acquired_from, acquired_to,
 mesh_path, input_hash, settings_hash, engine_version"""
