@@ -31,6 +31,8 @@ from pipeline.roof.arrangement.movable_borders import (
 )
 from pipeline.roof.arrangement.raster_labels import Limits
 
+_NEEDLE_MM2 = 1e5
+"""Borders that sweep less when a vertex moves go hardly anywhere, however far it moves along them."""
 _ROUNDS = 8
 """Most turns through all edges: bounds the work; it ends as soon as nothing changes."""
 
@@ -84,12 +86,18 @@ def _may_move(borders: Borders, edge: int, found: IntArray, m: int, reach_m: flo
     """Whether the vertex with the m found edges may move along one of them: on outline or guide, and not too far."""
     xy, edges = borders.xy, borders.edges
     a, b = edges[edge, 0], edges[edge, 1]
-    on_outline = False
+    on_outline, swept = False, 0.0
     for s in range(m):
         on_outline = on_outline or edges[found[s], 3] < 0
+        for end in range(2):
+            o = edges[found[s], end]
+            if o not in (a, b):
+                ax, ay = xy[b, 0] - xy[a, 0], xy[b, 1] - xy[a, 1]
+                swept += 0.5 * abs(float(ax * (xy[o, 1] - xy[a, 1]) - ay * (xy[o, 0] - xy[a, 0])))
         if edges[found[s], KEEPS] != 0 and not are_parallel(xy, edges, edge, found[s]):
             return False
     is_far = math.hypot(float(xy[a, 0] - xy[b, 0]), float(xy[a, 1] - xy[b, 1])) > reach_m * 1e3
+    is_far = is_far and swept > _NEEDLE_MM2  # the tip of a needle may be far from its base
     return not (is_far and m > 2) and not (on_outline and edges[edge, 3] >= 0)
 
 

@@ -99,7 +99,7 @@ def test_what_a_failed_candidate_lacks_is_null_and_not_zero(contexts: Contexts) 
         *("source_id", "geometry", "lod", "eave_z", "ridge_z", "h_min", "h_50p", "h_70p", "h_max", "height_m"),
         *("footprint_area_m2", "footprint_share", "roof_area_m2", "volume_m3", "density_per_m2", "rmse_m", "p95_m"),
         *("point_spacing_m", "noise_m", "share_within_0_2m", "unexplained_m2", "largest_hole_m", "ridge_z_sigma_m"),
-        *("share_below_roof", "extrapolated_share"),
+        *("share_below_roof", "extrapolated_share", "outline_sigma_m"),
         *("strip_offset_m", "ground_noise_m", "wall_outline", "overhang_m", "overhang_sigma_m"),
         *("overhang_source", "lod23_reason"),
         *("through_share", "detection_confidence", "ground_source", "height_source"),
