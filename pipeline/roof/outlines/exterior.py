@@ -24,7 +24,6 @@ from pipeline.roof.edge_position import EdgePoints, mixed_pulse_reach_mm, outwar
 from pipeline.roof.footprint import polygons_of
 from pipeline.roof.lines import Run, corners, crossing, fitted_run, projected
 from pipeline.roof.outlines.description import FREE, Prices, least_description
-from pipeline.roof.outlines.few_points import are_few, directions, envelope_mm, likeliest
 from pipeline.roof.roof_settings import RoofSettings
 from pipeline.roof.snapped_rings import differ_by_more, on_grid, snapped_ring
 
@@ -40,6 +39,8 @@ _BREAK_SPACINGS = 0.45
 """Edges end at vertices that are this far apart at least."""
 _FACTORS = (1.0, 0.6, 0.35)
 """Times the noise: an outline that cannot be drawn with few edges is tried with more."""
+_FEW_POINTS, _FEW_SPACING_M = 150, 2.0
+"""So few points, so far apart, show directions badly: outlines in all directions are compared."""
 _FEWEST, _FEW_BREAKS = 4, 60
 """A ring of so few breaks has four edges at least."""
 _APART = math.radians(8.0)
@@ -117,7 +118,7 @@ def _straight_rings(
     drawn: list[FloatArray | None] = [None] * len(borders)
     least_mm = min(max(_NOISE_OF_SIZE * math.sqrt(polygon.area), 100.0), settings.min_outline_noise_m * 1e3)
     noise_mm = max(settings.outline_noise_spacings * spacing_m * 1e3, least_mm)
-    if points is not None and are_few(len(points.xy_mm), spacing_m):
+    if points is not None and len(points.xy_mm) <= _FEW_POINTS and spacing_m >= _FEW_SPACING_M:
         drawn[0] = _of_few_points(borders[0], spacing_m, points, noise_mm)
     for factor in _FACTORS:
         rings = [_with_breaks(border, _BREAK_SPACINGS * spacing_m * 1e3) for border in borders]
@@ -136,6 +137,8 @@ def _straight_rings(
 
 def _of_few_points(border: FloatArray, spacing_m: float, points: EdgePoints, noise_mm: float) -> FloatArray | None:
     """The likeliest ring around few points: as described, or in two directions of any."""
+    from pipeline.roof.outlines.few_points import directions, envelope_mm, likeliest
+
     xy_mm = points.xy_mm.astype(np.float64)
     near = shapely.contains_xy(shapely.buffer(Polygon(border), 1e3 * spacing_m), xy_mm)
     xy_mm = xy_mm[near]

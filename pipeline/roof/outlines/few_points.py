@@ -17,21 +17,12 @@ from shapely import Polygon
 from pipeline.model import FloatArray
 from pipeline.roof.lines import Run
 
-MOST_POINTS = 150
-"""More points show directions well."""
-_LEAST_SPACING_M = 2.0
-"""As do points that lie closer."""
 _OFF_MM = 120.0
 """Standard deviation of a point about the edge that it lies outside of."""
 _MOST = 8.0
 """Most that a point outside costs, nats: it may be no roof."""
 _STEP = math.radians(5.0)
 """Between the directions that are tried."""
-
-
-def are_few(n_points: int, spacing_m: float) -> bool:
-    """Whether outlines around some points are compared in all directions."""
-    return n_points <= MOST_POINTS and spacing_m >= _LEAST_SPACING_M
 
 
 def directions() -> FloatArray:
