@@ -96,7 +96,6 @@ export interface Crs extends Units {
 /** The part of the report that the page reads. */
 export interface RunReport {
   crs?: Crs;
-  /** What made the run. */
   engine_version?: string;
   method?: string;
   settings_hash?: string;

@@ -184,8 +184,8 @@ class Changes implements View {
       );
       return;
     }
-    const note = makersNote(before.objects.report, after.objects.report);
-    this.note.replaceChildren(...(note === null ? [] : [warningNotice(note)]));
+    const notes = [makersNote(before.objects.report, after.objects.report)].filter((note) => note !== "");
+    this.note.replaceChildren(...notes.map((note) => warningNotice(note)));
     const shift = shiftOf(before, after);
     this.found = sorted(pairs(placed(before, [0, 0]), placed(after, shift)));
     this.draw([before, after], shift);

@@ -35,17 +35,12 @@ export const CHANGES: Record<Change, { label: string; colour: string; words: str
 /** Differences below these are not reported: heights in metres, footprints as a share and in square metres. */
 export const LIMITS = { heightM: 0.5, areaShare: 0.05, areaM2: 2 } as const;
 
-/** What made a run. */
-export type Maker = Pick<RunReport, "engine_version" | "method" | "settings_hash">;
-
-/** What differs between the makers of two runs of one method, and what that means for shapes; null if nothing does. */
-export function makersNote(old: Maker, now: Maker): string | null {
+/** What differs between what made two runs of one method, and what that means for shapes; empty if nothing does. */
+export function makersNote(old: RunReport, now: RunReport): string {
   const versions = [old, now].map(({ engine_version }) => engine_version ?? "an unknown version");
-  const parts = [
-    versions[0] === versions[1] ? null : `The versions differ: left is of ${versions.join(", right of ")}.`,
-    old.method !== now.method || old.settings_hash === now.settings_hash ? null : "The settings differ.",
-  ].filter((part) => part !== null);
-  return parts.length === 0 ? null : `${parts.join(" ")} Outlines and roofs may be drawn anew where nothing was built.`;
+  const ofVersions = versions[0] === versions[1] ? "" : `The versions differ: left is of ${versions.join(", right of ")}. `;
+  const ofSettings = old.method === now.method && old.settings_hash !== now.settings_hash ? "The settings differ. " : "";
+  return ofVersions + ofSettings && `${ofVersions}${ofSettings}Outlines and roofs may be drawn anew where nothing was built.`;
 }
 
 const MIN_OVERLAP = 0.3; // of what both plans cover together
