@@ -9,6 +9,7 @@ import dataclasses
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 
+import numpy as np
 import shapely
 
 from pipeline.model import Reason
@@ -154,7 +155,7 @@ def scale_of(points: int) -> int:
 def may_touch(briefs: Collection[SitesBrief]) -> bool:
     """Whether candidates may have outlines that touch: those of one task, or of tasks whose boxes meet."""
     reach = [box_around(group.reach_mm for group in brief.groups) for brief in briefs]
-    boxes = [shapely.box(*box) for box in reach if box is not None]
+    boxes = np.array([shapely.box(*box) for box in reach if box is not None], dtype=object)
     meet = len(shapely.STRtree(boxes).query(boxes, predicate="intersects").T) > len(boxes)
     return meet or any(brief.come_near for brief in briefs)
 

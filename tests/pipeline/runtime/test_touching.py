@@ -13,6 +13,7 @@ from run_tables import rows
 
 from pipeline.runtime.run import RunSummary
 from pipeline.runtime.stages.sites import CandidateSite, near_pairs
+from pipeline.runtime.stages.stored_sites import SitesBrief, may_touch
 from pipeline.tiling import Tile
 
 SHEDS = (((12.0, 12.0, 24.0, 20.0), 60.0), ((23.7, 13.0, 32.0, 19.0), 54.0), ((14.0, 19.7, 22.0, 27.0), 55.5))
@@ -82,3 +83,8 @@ def test_units_of_one_block_that_were_drawn_together_are_not_compared() -> None:
     alone = dataclasses.replace(other, outline=None)
     assert near_pairs([site, alone, far, given]).tolist() == [[0, 1]]
     assert near_pairs([far, given, other, dataclasses.replace(site, block=None)]).tolist() == [[2, 3]]
+
+
+def test_without_candidates_nothing_touches() -> None:
+    assert not may_touch([])
+    assert not may_touch([SitesBrief(groups=(), rejected=())])
