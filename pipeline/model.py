@@ -262,7 +262,7 @@ class Candidate:
     given: GivenHeights | None = None
     """Its heights by attributes, elevations in local metres; None without any."""
     outline: MultiPolygon | None = None
-    """Its part of the outline that it was drawn with the units it touches, local metres; None where it touches none."""
+    """Its outline, drawn with regard to what it touches, local metres; None where it is drawn around its own points."""
     beside: FloatArray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
     """(j, 3) float64, other points within about 2 m around and beneath, of pulses with one return: facades and ground.
     Empty unless outlines are drawn at the walls."""

@@ -67,7 +67,7 @@ def straighten_borders(partition: RoofPartition, planes: Sequence[Plane], spacin
         if min(arc.left, arc.right) < 0
         for a, b in itertools.pairwise(arc.path)
     ]
-    common = peaks_of(outline_runs)[:1]
+    common = peaks_of(outline_runs, 1)
     for arc in arcs:
         if min(arc.left, arc.right) >= 0:
             left, right = planes[partition.labels[arc.left]], planes[partition.labels[arc.right]]

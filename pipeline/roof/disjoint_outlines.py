@@ -3,13 +3,14 @@
 Outlines drawn one by one end about half a point spacing outside of the outermost points, so those of two sheds that
 touch cross. The division of an overlap follows from the two outlines and their points alone, so two tasks decide alike,
 whatever the order and the tiles. A third outline changes nothing between the two. Everything is done in integer
-millimetres of the CRS; a border between two outlines has the same corners on both sides.
+millimetres of the CRS. A border between two outlines has the same corners on both sides, except beside a third one.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Set as AbstractSet
 
 import numpy as np
 import shapely
@@ -41,6 +42,8 @@ _NEEDLE_MM = 120.0
 """Half the width of a part that is not left of an outline: no wing of a house is as narrow."""
 _SHORTEST_MM = 20.0
 """Corners nearer to each other are united when a solid is made, which would move a common border."""
+_ROUNDING_MM = 1.5
+"""Corners that rounding adds lie within this of a straight edge."""
 _MITRE = 6.0
 """Offset corners sharper than 20 degrees are cut."""
 
@@ -167,7 +170,8 @@ def left_of(
     own = polygons_of(shapely.coverage_union_all(cells[is_own]))
     if lost:
         own = [part for polygon in own for part in _without_needles(polygon)] or own
-    own = [_without_short_edges(polygon) for polygon in own]
+    known = {(x, y) for x, y in shapely.get_coordinates([outline_mm, *pieces]).tolist()}
+    own = [_without_short_edges(_without_rounded(polygon, known)) for polygon in own]
     large = [polygon for polygon in own if polygon.area >= min_area_m2 * 1e6]
     if not own:
         return outline_mm
@@ -181,6 +185,22 @@ def _without_needles(polygon: Polygon) -> list[Polygon]:
     opened = shapely.buffer(inner, _NEEDLE_MM, join_style="mitre", mitre_limit=_MITRE)
     needles = [one for one in polygons_of(shapely.difference(polygon, opened)) if _is_needle(one)]
     return polygons_of(shapely.difference(polygon, MultiPolygon(needles), grid_size=1.0)) if needles else [polygon]
+
+
+def _without_rounded(polygon: Polygon, known: AbstractSet[tuple[float, float]]) -> Polygon:
+    """A polygon without corners that rounding added on straight edges: the other side has none there."""
+    rings = []
+    for ring in shapely.get_rings(polygon).tolist():
+        xy = shapely.get_coordinates(ring)[:-1]
+        before, after = np.roll(xy, 1, axis=0), np.roll(xy, -1, axis=0)
+        (ux, uy), (dx, dy) = (after - before).T, (xy - before).T
+        is_straight = np.abs(ux * dy - uy * dx) <= _ROUNDING_MM * np.hypot(ux, uy)
+        is_known = np.array([(x, y) in known for x, y in xy.tolist()])
+        rings.append(xy[is_known | ~is_straight])
+    if min(map(len, rings)) < 3:
+        return polygon
+    plain = Polygon(rings[0], rings[1:])
+    return plain if plain.is_valid else polygon
 
 
 def _is_needle(part: Polygon) -> bool:

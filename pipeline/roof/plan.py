@@ -72,7 +72,7 @@ class RoofPoints:
     footprint_mm: MultiPolygon | None
     """The given footprint in integer millimetres."""
     outline_mm: MultiPolygon | None = None
-    """The outline that was drawn together with touching units; integer millimetres."""
+    """The outline that was drawn with regard to touching units and candidates; integer millimetres."""
     guides: tuple[Guide, ...] = ()
     """Given lines, local metres."""
     guide_distance_m: float = 0.0
@@ -258,7 +258,7 @@ def _traced_plan(roof: RoofPoints, planes: Sequence[Plane], settings: RoofSettin
 
 
 def drawn_outline(roof: RoofPoints, settings: RoofSettings) -> MultiPolygon:
-    """The outline of a building, integer millimetres: given, drawn with touching units, or drawn around its points.
+    """The outline of a building, integer millimetres: given, drawn with regard to others, or drawn around its points.
 
     Raises BuildingError as `partition_roof`.
     """

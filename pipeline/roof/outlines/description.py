@@ -5,7 +5,7 @@ edge may have (Bellman 1961; Perez and Vidal 1994 for polygons). The description
 description length (Rissanen 1978): what the edges leave unexplained, the negative logarithm of a normal density, with
 one independent observation per point spacing; and a price per edge, per change of direction. A start of an edge is
 given up once it cannot win anywhere (Killick, Fearnhead and Eckley 2012), so the work grows little faster than the
-border.
+border. A turn at an edge in a direction of its own is priced for the best edge before it, chosen without that turn.
 """
 
 from __future__ import annotations
@@ -140,7 +140,7 @@ def least_description(
     live = np.empty(m, np.int64)
     live[0] = 0
     alive = 1
-    spare = prices.edge + prices.free + prices.change
+    spare = prices.edge + prices.free + prices.change + max(prices.sharp, prices.flat)
     for j in range(1, m):
         xj, yj = border[breaks[j] % n, 0], border[breaks[j] % n, 1]
         reached = np.full(alive, np.inf)

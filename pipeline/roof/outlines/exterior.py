@@ -51,6 +51,8 @@ _PEAK = math.radians(2.5)
 """How far directions of edges scatter about a common one."""
 _LEAST_PEAK = 0.05
 """Least weight of a direction that is tried, as a share of that of the first."""
+_VOTERS = 400
+"""The longest edges alone are asked for directions: the time grows with the square of their number."""
 _TRIED = 5
 """Most directions that are tried."""
 _NOISE_OF_SIZE = 0.035
@@ -92,7 +94,8 @@ def straighten(
             cut = shapely.difference(
                 Polygon(outer), shapely.union_all([Polygon(hole) for hole in holes]), grid_size=1.0
             )
-            drawn = max(polygons_of(cut), key=lambda piece: piece.area, default=orient(part))
+            straightened += polygons_of(cut) or [orient(part)]
+            continue
         straightened.append(drawn)
     result = MultiPolygon(straightened)
     if not result.is_valid:
@@ -235,26 +238,25 @@ def off_square(direction: float, dominant: float) -> float:
     return math.remainder(direction - dominant, _QUARTER)
 
 
-def peaks_of(runs: Sequence[Run]) -> list[float]:
+def peaks_of(runs: Sequence[Run], most: int = _TRIED) -> list[float]:
     """Directions, modulo a right angle, that most of the squared length of some edges has, the first with most."""
-    left = [(run.direction, run.length**2) for run in runs]
-    whole = math.fsum(weight for _, weight in left)
+    longest = sorted(runs, key=lambda run: -run.length)[:_VOTERS]
+    angles, weights = np.array([(run.direction, run.length**2) for run in longest]).reshape(-1, 2).T
     found: list[float] = []
     first = 0.0
-    while left and len(found) < _TRIED and whole > 0.0:
-        votes = [
-            math.fsum(weight * math.exp(-0.5 * (off_square(other, angle) / _PEAK) ** 2) for other, weight in left)
-            for angle, _ in left
-        ]
-        best = max(range(len(left)), key=votes.__getitem__)
+    while len(angles) and len(found) < most and weights.sum() > 0.0:
+        off = angles[:, None] - angles[None, :]
+        off -= _QUARTER * np.rint(off / _QUARTER)
+        near = weights[:, None] * np.exp(-0.5 * (off / _PEAK) ** 2)
+        votes = near.sum(axis=0)
+        best = int(np.argmax(votes))
         first = first or votes[best]
         if votes[best] < _LEAST_PEAK * first:
             break
-        about = left[best][0]
-        near = [(off_square(other, about), weight) for other, weight in left if abs(off_square(other, about)) < _APART]
-        share = [(off, weight * math.exp(-0.5 * (off / _PEAK) ** 2)) for off, weight in near]
-        found.append(about + math.fsum(off * w for off, w in share) / math.fsum(w for _, w in share))
-        left = [(other, weight) for other, weight in left if abs(off_square(other, about)) >= _APART]
+        is_here = np.abs(off[:, best]) < _APART
+        share = near[is_here, best]
+        found.append(float(angles[best] + (off[is_here, best] * share).sum() / share.sum()))
+        angles, weights = angles[~is_here], weights[~is_here]
     return found
 
 

@@ -39,7 +39,7 @@ def envelope_mm(run: Run, xy_mm: FloatArray, area_mm2: float, out_mm: float) -> 
     dx, dy = xy_mm[:, 0] - run.x, xy_mm[:, 1] - run.y
     off, along = dx * uy - dy * ux, dx * ux + dy * uy
     beside = np.sort(off[(np.abs(along) <= 0.5 * run.length) & (np.abs(off) <= out_mm)])[::-1]
-    if len(beside) == 0:
+    if len(beside) == 0 or run.length == 0.0:
         return 0.0
     a_mm = len(xy_mm) * run.length / area_mm2
     beyond = np.maximum(beside[:, None] - beside[None, :], 0.0)

@@ -84,7 +84,7 @@ def divided(
     lost = set(units.labels.tolist()) - set(owners)
     if lost:
         # a unit that no wall separates is drawn around its own points
-        directions = pairs_of(peaks_of(_edge_runs(edges))[:3])
+        directions = pairs_of(peaks_of(_edge_runs(edges), 3))
         around = [
             _drawn_around(polygon.exterior, directions, spacing_m)
             for polygon, label in zip(units.polygons, units.labels.tolist(), strict=True)
@@ -272,17 +272,24 @@ def _cells(
     order = sorted(range(len(cells)), key=lambda k: (cells[k].area, cells[k].bounds))
     tree = shapely.STRtree(cells)
     for k in order:
-        cell = cells[k]
-        if owners[k] >= 0 and cell.area >= _LEAST_CELL_MM2 and not _is_narrow(cell):
-            continue
-        shares = [
-            (shapely.intersection(cell, cells[j]).length, -j)
-            for j in tree.query(cell, predicate="touches").tolist()
-            if owners[j] >= 0
-        ]
-        if shares:
-            owners[k] = owners[-max(shares)[1]]
+        if owners[k] < 0 or cells[k].area < _LEAST_CELL_MM2 or _is_narrow(cells[k]):
+            _join_neighbour(k, cells, owners, tree)
+    # cells amid others without points: each round joins those that touch a cell of a unit
+    while sum(owners[k] < 0 and _join_neighbour(k, cells, owners, tree) for k in order):
+        pass
     return cells, owners
+
+
+def _join_neighbour(k: int, cells: Sequence[Polygon], owners: list[int], tree: shapely.STRtree) -> bool:
+    """Give a cell to the unit of the neighbour with the longest common wall; whether it has one with a unit."""
+    shares = [
+        (shapely.intersection(cells[k], cells[j]).length, -j)
+        for j in tree.query(cells[k], predicate="touches").tolist()
+        if owners[j] >= 0
+    ]
+    if shares:
+        owners[k] = owners[-max(shares)[1]]
+    return bool(shares)
 
 
 def _is_narrow(cell: Polygon) -> bool:

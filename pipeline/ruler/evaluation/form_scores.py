@@ -138,6 +138,8 @@ def _inner_edges(models: Sequence[RoofModel], blocks: Geometries, block: IntArra
     """The columns of `FormScore.inner`, (b,)."""
     columns = {f"{kind}_{name}": np.zeros(len(blocks)) for kind in _KINDS for name in ("length_m", "along_m", "short")}
     stretches, owner, is_wall = _inner_stretches(models)
+    known = block[owner] >= 0  # a footprint without area lies in no block
+    stretches, owner, is_wall = stretches[known], owner[known], is_wall[known]
     of = block[owner]
     order = np.argsort(of, kind="stable")
     for here in np.split(order, np.flatnonzero(np.diff(of[order])) + 1) if len(of) else ():

@@ -56,7 +56,11 @@ def united_blocks(outlines: Geometries) -> Geometries:
     """The outlines with gaps of up to 0.3 m closed, united: one polygon for all that touch, (b,)."""
     wider = shapely.buffer(np.append(outlines, shapely.Polygon()), _HALF_GAP_M, join_style="mitre")
     closed = shapely.buffer(shapely.union_all(wider), -_HALF_GAP_M, join_style="mitre")
-    parts = [max(shapely.get_parts(one), key=shapely.area) for one in sound_polygons(shapely.get_parts(closed))]
+    parts = [
+        max(shapely.get_parts(one), key=shapely.area)
+        for one in sound_polygons(shapely.get_parts(closed))
+        if one.area > 0.0
+    ]
     blocks = np.empty(len(parts), object)
     blocks[:] = parts
     return blocks

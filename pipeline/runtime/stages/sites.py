@@ -249,7 +249,7 @@ def tiles_of(sites: Iterable[CandidateSite], grid: TileGrid) -> set[Tile]:
 def near_pairs(sites: Sequence[CandidateSite]) -> IntArray:
     """Pairs of sites by their numbers, (k, 2), the smaller first, whose outlines may touch.
 
-    Units of one block that were drawn together do not: their borders are common already.
+    Units of one block that were drawn together are left out: their borders are common already.
     """
     number = np.array([k for k, site in enumerate(sites) if site.reach_mm is not None], np.int64)
     boxes = shapely.box(*np.array([sites[k].reach_mm for k in number], np.float64).reshape(-1, 4).T)

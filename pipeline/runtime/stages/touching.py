@@ -10,13 +10,14 @@ import collections
 import dataclasses
 import functools
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import TypeVar
 
 import numpy as np
 import shapely
 from shapely import MultiPolygon
 
-from pipeline.errors import BuildingError
+from pipeline.errors import BuildingError, GableworkError
 from pipeline.io.gps_time import GpsTimeKind
 from pipeline.model import IntArray
 from pipeline.prepared_cloud import prepare_cloud
@@ -39,6 +40,8 @@ from pipeline.runtime.stages.sites import (
 )
 from pipeline.runtime.stages.stored_sites import group_figures
 from pipeline.tiling import MM, Tile, TileGrid
+
+Result = TypeVar("Result")
 
 STAGE = "touching"
 """The stage under which groups are stored whose candidates were drawn again."""
@@ -70,6 +73,8 @@ class TouchBrief:
     """The owner's groups in which an outline was drawn, by their numbers; in this order they are parts."""
 
     groups: Mapping[int, GroupFigures]
+    warnings: tuple[str, ...] = ()
+    """What could not be drawn or compared."""
 
 
 def drawn_apart(context: RunContext, roof: RoofSettings, joined: Joined) -> Joined:
@@ -98,6 +103,8 @@ def drawn_apart(context: RunContext, roof: RoofSettings, joined: Joined) -> Join
     drop_outcomes(context.scratch, STAGE, tasks)
     files: Files[TouchTask, TouchBrief] = Files(reads=_read)
     found = context.map_stored("outline", draw_apart, tasks, brief_within, files=files, quiet=True)
+    for warning in sorted({warning for brief in found.values() for warning in brief.warnings}):
+        context.progress.warn("outline", warning)
     groups: list[StoredGroup] = []
     for place, task in tasks.items():
         part = {number: k for k, number in enumerate(found[place].groups)}
@@ -129,24 +136,30 @@ def draw_apart(task: TouchTask) -> InParts[TouchBrief]:
     groups = [group.sites(task.scratch) for group in (*task.own, *task.others)]
     sites = [site for group in groups for site in group]
     owned = sum(len(group) for group in groups[: len(task.own)])
-    outlines = _outlines_of(sites, owned, task)
+    warnings: list[str] = []
+    outlines = _outlines_of(sites, owned, task, warnings)
     changed: dict[int, tuple[CandidateSite, ...]] = {}
     for number, group in enumerate(groups[: len(task.own)]):
         new = tuple(dataclasses.replace(site, outline=outlines.get(site.building_id, site.outline)) for site in group)
         if any(site.building_id in outlines for site in group):
             changed[number] = new
     figures = {number: group_figures(group, task.grid) for number, group in changed.items()}
-    return InParts(parts=tuple(changed.values()), brief=TouchBrief(groups=figures))
+    return InParts(parts=tuple(changed.values()), brief=TouchBrief(groups=figures, warnings=tuple(warnings)))
 
 
-def _outlines_of(sites: Sequence[CandidateSite], owned: int, task: TouchTask) -> dict[str, MultiPolygon]:
-    """The outlines, metres, of those of the first `owned` sites that end near others, by their building_id."""
+def _outlines_of(
+    sites: Sequence[CandidateSite], owned: int, task: TouchTask, warnings: list[str]
+) -> dict[str, MultiPolygon]:
+    """The outlines, metres, of those of the first `owned` sites that end near others, by their building_id.
+
+    What fails without a known reason leaves its candidates as they are drawn alone, with a warning.
+    """
     pairs = near_pairs(sites)
     pairs = pairs[pairs[:, 0] < owned]
     drawn: dict[int, MultiPolygon] = {}
     for k in np.unique(pairs).tolist():
         task.scratch.check_cancelled()
-        outline_mm = _drawn_mm(sites[k], task)
+        outline_mm = _or_warned(warnings, (sites[k],), functools.partial(_drawn_mm, sites[k], task))
         if outline_mm is not None:
             drawn[k] = outline_mm
     known = np.array([i in drawn and j in drawn for i, j in pairs.tolist()], np.bool_)
@@ -165,7 +178,10 @@ def _outlines_of(sites: Sequence[CandidateSite], owned: int, task: TouchTask) ->
     lost: dict[int, list[shapely.Polygon]] = collections.defaultdict(list)
     for i, j in pairs[overlapping].tolist():
         task.scratch.check_cancelled()
-        of_first, of_second = divided(claim(i), claim(j))
+        parts = _or_warned(warnings, (sites[i], sites[j]), lambda i=i, j=j: divided(claim(i), claim(j)))
+        if parts is None:
+            continue
+        of_first, of_second = parts
         kept[i] += of_first
         lost[i] += of_second
         kept[j] += of_second
@@ -173,9 +189,22 @@ def _outlines_of(sites: Sequence[CandidateSite], owned: int, task: TouchTask) ->
     outlines = {}
     for k in np.unique(pairs[near]).tolist():
         if k < owned:
-            apart = left_of(drawn[k], kept[k], lost[k], task.roof.min_part_area_m2)
-            outlines[sites[k].building_id] = shapely.transform(apart, lambda xy: xy / MM)
+            cut = functools.partial(left_of, drawn[k], kept[k], lost[k], task.roof.min_part_area_m2)
+            apart = _or_warned(warnings, (sites[k],), cut)
+            outlines[sites[k].building_id] = shapely.transform(drawn[k] if apart is None else apart, lambda xy: xy / MM)
     return outlines
+
+
+def _or_warned(warnings: list[str], sites: Sequence[CandidateSite], draw: Callable[[], Result]) -> Result | None:
+    """What a function returns; None, and a warning that names the candidates, for a fault that nothing foresaw."""
+    try:
+        return draw()
+    except (MemoryError, OSError, GableworkError):
+        raise
+    except Exception as error:  # noqa: BLE001 - becomes a warning of the run
+        names = ", ".join(site.building_id for site in sites)
+        warnings.append(f"the outlines of {names} are drawn without regard to others: {type(error).__name__}: {error}")
+        return None
 
 
 def _drawn_mm(site: CandidateSite, task: TouchTask) -> MultiPolygon | None:

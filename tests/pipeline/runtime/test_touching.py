@@ -14,6 +14,7 @@ from run_tables import rows
 from pipeline.runtime.run import RunSummary
 from pipeline.runtime.stages.sites import CandidateSite, near_pairs
 from pipeline.runtime.stages.stored_sites import SitesBrief, may_touch
+from pipeline.runtime.stages.touching import _or_warned
 from pipeline.tiling import Tile
 
 SHEDS = (((12.0, 12.0, 24.0, 20.0), 60.0), ((23.7, 13.0, 32.0, 19.0), 54.0), ((14.0, 19.7, 22.0, 27.0), 55.5))
@@ -88,3 +89,17 @@ def test_units_of_one_block_that_were_drawn_together_are_not_compared() -> None:
 def test_without_candidates_nothing_touches() -> None:
     assert not may_touch([])
     assert not may_touch([SitesBrief(groups=(), rejected=())])
+
+
+def test_a_fault_that_nothing_foresaw_is_a_warning_and_a_known_one_is_passed_on() -> None:
+    warnings: list[str] = []
+    site = CandidateSite(building_id="shed", owner=Tile(0, 0), ranges=(), points=0)
+
+    def fails(error: Exception) -> None:
+        raise error
+
+    assert _or_warned(warnings, (site,), lambda: 3) == 3
+    assert _or_warned(warnings, (site,), lambda: fails(ZeroDivisionError("by zero"))) is None
+    assert warnings == ["the outlines of shed are drawn without regard to others: ZeroDivisionError: by zero"]
+    with pytest.raises(OSError, match="scratch"):
+        _or_warned(warnings, (site,), lambda: fails(OSError("scratch")))
