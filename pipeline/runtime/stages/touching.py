@@ -174,11 +174,14 @@ def _outlines_of(
         places: IntArray = np.column_stack([points[axis] for axis in "xyz"]).astype(np.int64)
         return Claim(name=sites[k].building_id, outline_mm=drawn[k], points_mm=places)
 
+    def of_pair(i: int, j: int) -> tuple[list[shapely.Polygon], list[shapely.Polygon]]:
+        return divided(claim(i), claim(j))
+
     kept: dict[int, list[shapely.Polygon]] = collections.defaultdict(list)
     lost: dict[int, list[shapely.Polygon]] = collections.defaultdict(list)
     for i, j in pairs[overlapping].tolist():
         task.scratch.check_cancelled()
-        parts = _or_warned(warnings, (sites[i], sites[j]), lambda i=i, j=j: divided(claim(i), claim(j)))
+        parts = _or_warned(warnings, (sites[i], sites[j]), functools.partial(of_pair, i, j))
         if parts is None:
             continue
         of_first, of_second = parts
