@@ -32,7 +32,7 @@ class Run:
     length: float
     """From the first to the last vertex."""
     exact: bool = False
-    """Whether the line is known otherwise than by the stretch."""
+    """Whether the line, or its direction, is known otherwise than by the stretch."""
 
 
 def fitted_run(border: FloatArray, first: int, last: int) -> Run:

@@ -56,7 +56,7 @@ _VOTERS = 400
 _TRIED = 5
 """Most directions that are tried."""
 _NOISE_OF_SIZE = 0.035
-"""The least noise is no more than this share of the root of the area: small houses show finer edges."""
+"""Small houses show finer edges: their least noise is this part of the square root of their area."""
 _LEAST_SPACINGS, _LEAST_M = 0.75, 0.3
 """Shorter edges are left out: in point spacings, and at least."""
 _MOVED = 1.2
@@ -123,18 +123,18 @@ def _straight_rings(
     noise_mm = max(settings.outline_noise_spacings * spacing_m * 1e3, least_mm)
     if points is not None and len(points.xy_mm) <= _FEW_POINTS and spacing_m >= _FEW_SPACING_M:
         drawn[0] = _of_few_points(borders[0], spacing_m, points, noise_mm)
+    rings = [_with_breaks(border, _BREAK_SPACINGS * spacing_m * 1e3) for border in borders]
+    least = max(_LEAST_SPACINGS * spacing_m, _LEAST_M) * 1e3
     for factor in _FACTORS:
-        rings = [_with_breaks(border, _BREAK_SPACINGS * spacing_m * 1e3) for border in borders]
+        if all(ring is not None for ring in drawn):
+            break
         for k, (border, runs) in enumerate(described(rings, spacing_m * 1e3, factor * noise_mm)):
             if drawn[k] is None and len(runs) > 2:
-                least = max(_LEAST_SPACINGS * spacing_m, _LEAST_M) * 1e3
                 drawn[k] = _ring_of(border, runs, least, noise_mm)
                 if drawn[k] is not None and points is not None:
                     _take_positions(border, runs, points, reach_mm)
                     moved = _ring_of(border, runs, least, noise_mm + points.spacing_mm)
                     drawn[k] = drawn[k] if moved is None else moved
-        if all(ring is not None for ring in drawn):
-            break
     return [raw if ring is None else ring for raw, ring in zip(borders, drawn, strict=True)]
 
 

@@ -42,7 +42,11 @@ _IN_LINE_GAP_MM = 4000.0
 _PARALLEL = 0.03
 """Sine of the angle between walls that can be in line."""
 _SHORTEST_MM = 300.0
-"""Shorter borders between units are no walls, and shorter edges are in line with nothing."""
+"""A border between units is a wall from this length on. An edge must be as long to bring a wall in line."""
+_STRAIGHT_ON = -0.8
+"""Cosine between two borders, seen from where they meet: from 143 degrees on, one goes on in the other."""
+_WAY_MM = 2500.0
+"""The direction of a border at its end is that of this much of it."""
 _OVERSHOOT_MM = 5.0
 """Walls end this far beyond what they meet: the lines must cross."""
 _LEAST_CELL_MM2 = 2e6
@@ -124,13 +128,8 @@ def _edge_runs(edges: FloatArray) -> list[Run]:
 
 def _borders(units: RoofPartition, within: Polygon | MultiPolygon) -> list[FloatArray]:
     """The borders between two units, (n, 2) each, as far as they lie within an area."""
-    numbers = sorted(set(units.labels.tolist()))
-    whole = [
-        shapely.coverage_union_all(
-            [p for p, label in zip(units.polygons, units.labels.tolist(), strict=True) if label == k]
-        )
-        for k in numbers
-    ]
+    polygons = np.array(units.polygons, dtype=object)
+    whole = [shapely.coverage_union_all(polygons[units.labels == number]) for number in np.unique(units.labels)]
     lines = shapely.boundary(np.array(whole, dtype=object))
     tree = shapely.STRtree(lines)
     first, second = tree.query(lines, predicate="intersects")
@@ -160,7 +159,7 @@ def _through(borders: Sequence[FloatArray]) -> list[FloatArray]:
         ways = {end: _way_from(borders[end[0]], end[1]) for end in meeting}
         pairs = [(float(ways[a] @ ways[b]), a, b) for a, b in itertools.combinations(meeting, 2) if a[0] != b[0]]
         straightest = min(pairs, default=None)
-        if straightest is not None and straightest[0] < -0.8:
+        if straightest is not None and straightest[0] < _STRAIGHT_ON:
             _, a, b = straightest
             follows[a], follows[b] = b, a
     united: list[FloatArray] = []
@@ -190,7 +189,7 @@ def _through(borders: Sequence[FloatArray]) -> list[FloatArray]:
 def _way_from(border: FloatArray, at_start: bool) -> FloatArray:
     """The unit vector from an end of a border into it."""
     line = LineString(border if at_start else border[::-1])
-    inner = np.asarray(line.interpolate(min(2500.0, line.length)).coords[0])
+    inner = np.asarray(line.interpolate(min(_WAY_MM, line.length)).coords[0])
     way = inner - np.asarray(line.coords[0])
     return np.asarray(way / max(math.hypot(*way.tolist()), 1e-9))
 

@@ -71,7 +71,7 @@ export class RunObjects implements Run {
   }
 }
 
-/** A corner of the first outline, in whole units: where there is no model, the figures would be too coarse far from it. */
+/** A corner of the first outline, rounded: the scene is drawn about it, since large coordinates lose digits. */
 function cornerOf(features: readonly Feature[]): [number, number, number] | null {
   const corner = features.flatMap(({ geometry }) => ringsOf(geometry))[0]?.[0];
   return corner === undefined ? null : [Math.round(corner[0]), Math.round(corner[1]), 0];
