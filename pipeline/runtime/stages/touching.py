@@ -14,6 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TypeVar
 
 import numpy as np
+import numpy.typing as npt
 import shapely
 from shapely import MultiPolygon
 
@@ -21,12 +22,13 @@ from pipeline.errors import BuildingError, GableworkError
 from pipeline.io.gps_time import GpsTimeKind
 from pipeline.model import IntArray
 from pipeline.prepared_cloud import prepare_cloud
-from pipeline.roof.disjoint_outlines import Claim, divided, left_of
+from pipeline.roof.disjoint_outlines import GAP_MM, Claim, Slit, closed, divided, left_of, slits
 from pipeline.roof.plan import drawn_outline, roof_points
 from pipeline.roof.roof_settings import RoofSettings
 from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import OpenScratch, Scratch
 from pipeline.runtime.scratch.outcomes import Files, InParts, Place, brief_within, drop_outcomes, key_of
+from pipeline.runtime.stages.beside import points_beside
 from pipeline.runtime.stages.gather import gather, points_of
 from pipeline.runtime.stages.sites import (
     CandidateSite,
@@ -39,7 +41,9 @@ from pipeline.runtime.stages.sites import (
     near_pairs,
 )
 from pipeline.runtime.stages.stored_sites import group_figures
-from pipeline.tiling import MM, Tile, TileGrid
+from pipeline.runtime.stages.window_points import surroundings_of
+from pipeline.terrain.lattice import CELL_MM
+from pipeline.tiling import MM, Tile, TileGrid, Window
 
 Result = TypeVar("Result")
 
@@ -48,6 +52,10 @@ STAGE = "touching"
 _BESIDE_MM = 2000.0
 """An outline that ends so near to another one stays as it was compared: with the hidden points at walls, which are
 known when it is modelled, it could become that much larger."""
+_LEAST_SEEN = 0.1
+"""A slit is closed where it holds at least so much of the points that a roof as large would."""
+_MOST_GROUND, _GROUND_MM = 0.1, 1000
+"""At most so many of them lie at the terrain, or less than this above it."""
 _HELD = 16
 """Candidates whose points stay in memory from one overlap to the next."""
 
@@ -166,7 +174,11 @@ def _outlines_of(
     pairs = pairs[known]
     first, second = (np.array([drawn[k] for k in column.tolist()], object) for column in pairs.T)
     near = shapely.dwithin(first, second, _BESIDE_MM)
-    overlapping = shapely.intersects(first, second)
+    facing = [
+        tuple(sorted(pair, key=lambda k: sites[k].building_id))
+        for pair in pairs[shapely.dwithin(first, second, GAP_MM)].tolist()
+    ]
+    between = _slits(facing, sites, drawn, task, warnings)
 
     @functools.lru_cache(maxsize=_HELD)
     def claim(k: int) -> Claim:
@@ -174,21 +186,22 @@ def _outlines_of(
         places: IntArray = np.column_stack([points[axis] for axis in "xyz"]).astype(np.int64)
         return Claim(name=sites[k].building_id, outline_mm=drawn[k], points_mm=places)
 
-    def of_pair(i: int, j: int) -> tuple[list[shapely.Polygon], list[shapely.Polygon]]:
-        return divided(claim(i), claim(j))
-
     kept: dict[int, list[shapely.Polygon]] = collections.defaultdict(list)
     lost: dict[int, list[shapely.Polygon]] = collections.defaultdict(list)
-    for i, j in pairs[overlapping].tolist():
+
+    def divide(i: int, j: int) -> None:
+        (of_i, of_j), (more_of_i, more_of_j) = (
+            divided(claim(i), claim(j)),
+            closed(claim(i), claim(j), between[i, j]),
+        )
+        kept[i] += of_i + more_of_i
+        lost[i] += of_j
+        kept[j] += of_j + more_of_j
+        lost[j] += of_i
+
+    for i, j in facing:
         task.scratch.check_cancelled()
-        parts = _or_warned(warnings, (sites[i], sites[j]), functools.partial(of_pair, i, j))
-        if parts is None:
-            continue
-        of_first, of_second = parts
-        kept[i] += of_first
-        lost[i] += of_second
-        kept[j] += of_second
-        lost[j] += of_first
+        _or_warned(warnings, (sites[i], sites[j]), functools.partial(divide, i, j))
     outlines = {}
     for k in np.unique(pairs[near]).tolist():
         if k < owned:
@@ -196,6 +209,67 @@ def _outlines_of(
             apart = _or_warned(warnings, (sites[k],), cut)
             outlines[sites[k].building_id] = shapely.transform(drawn[k] if apart is None else apart, lambda xy: xy / MM)
     return outlines
+
+
+def _slits(
+    pairs: Sequence[tuple[int, int]],
+    sites: Sequence[CandidateSite],
+    drawn: Mapping[int, MultiPolygon],
+    task: TouchTask,
+    warnings: list[str],
+) -> dict[tuple[int, int], list[Slit]]:
+    """The slits between pairs of outlines that a wall or a roof fills, by pair: points lie in them, but no ground; those narrower than
+    the point spacing may be empty.
+
+    None lies beside a third outline. A task knows all outlines that reach into the boxes of both, so another task finds
+    the same slits.
+    """
+    found: dict[tuple[int, int], list[Slit]] = {}
+    for pair in pairs:
+        between = functools.partial(slits, *(drawn[k] for k in pair), _beside_two(pair, sites, drawn))
+        found[pair] = _or_warned(warnings, [sites[k] for k in pair], between) or []
+    areas = np.array([slit.area_mm for pair in pairs for slit in found[pair]], object)
+    heights = iter(_heights_in(areas, task) if len(areas) else ())
+    return {pair: [slit for slit in found[pair] if _is_built(slit, next(heights), pair, sites, drawn)] for pair in pairs}
+
+
+def _beside_two(
+    pair: tuple[int, int], sites: Sequence[CandidateSite], drawn: Mapping[int, MultiPolygon]
+) -> shapely.Geometry:
+    """Where all outlines are known to the tasks of two candidates, and no third one is near."""
+    known = shapely.intersection(*(shapely.box(*(sites[k].reach_mm or ())) for k in pair))
+    third = [outline for k, outline in drawn.items() if k not in pair and outline.intersects(known)]
+    beside = shapely.buffer(shapely.union_all(third), GAP_MM, join_style="mitre")
+    return shapely.difference(shapely.buffer(known, -GAP_MM), beside)
+
+
+def _is_built(
+    slit: Slit,
+    heights_mm: IntArray,
+    pair: tuple[int, int],
+    sites: Sequence[CandidateSite],
+    drawn: Mapping[int, MultiPolygon],
+) -> bool:
+    per_mm2 = sum(sites[k].points for k in pair) / sum(drawn[k].area for k in pair)
+    is_thin = (2.0 * slit.area_mm.area / slit.area_mm.length) ** 2 * per_mm2 < 1.0
+    least = 0.0 if is_thin else max(1.0, _LEAST_SEEN * per_mm2 * slit.area_mm.area)
+    is_ground = heights_mm < _GROUND_MM
+    return len(heights_mm) >= least and bool(np.count_nonzero(is_ground) <= _MOST_GROUND * len(heights_mm))
+
+
+def _heights_in(areas_mm: npt.NDArray[np.object_], task: TouchTask) -> list[IntArray]:
+    """The heights of the points in some areas above the terrain, of single and last returns, millimetres, by area."""
+    west, south, east, north = (round(value) for value in shapely.total_bounds(areas_mm))
+    around = surroundings_of(task.scratch, task.grid, Window(x0_mm=west, y0_mm=south, x1_mm=east + 1, y1_mm=north + 1))
+    boxes = shapely.bounds(areas_mm).astype(np.int64) // CELL_MM - np.tile([around.column0, around.row0], 2)
+    cells = np.zeros_like(around.occupied)
+    for x0, y0, x1, y1 in boxes.tolist():
+        cells[y0 : y1 + 1, x0 : x1 + 1] = True
+    places = np.concatenate(points_beside(task.scratch, task.grid, np.empty((0, 3), np.int64), cells, around))
+    columns, rows = (places[:, :2] // CELL_MM - [around.column0, around.row0]).T
+    heights_mm = places[:, 2] - around.elevation_mm[rows, columns]
+    area, inside = shapely.STRtree(shapely.points(places[:, :2])).query(areas_mm, predicate="contains")
+    return [heights_mm[inside[area == k]] for k in range(len(areas_mm))]
 
 
 def _or_warned(warnings: list[str], sites: Sequence[CandidateSite], draw: Callable[[], Result]) -> Result | None:
