@@ -1,7 +1,7 @@
-"""Outlines of different candidates that overlap or leave a slit, made to touch: each piece goes to one of the two.
+"""Outlines of different candidates that overlap, made disjoint: each piece of an overlap goes to one of the two.
 
 Outlines drawn one by one end about half a point spacing outside of the outermost points, so those of two sheds that
-touch cross, or leave a slit where points of the wall between them belong to neither. The division of an overlap follows from the two outlines and their points alone, so two tasks decide alike,
+touch cross. The division of an overlap follows from the two outlines and their points alone, so two tasks decide alike,
 whatever the order and the tiles. A third outline changes nothing between the two. Everything is done in integer
 millimetres of the CRS. A border between two outlines has the same corners on both sides, except beside a third one.
 """
@@ -44,10 +44,6 @@ _SHORTEST_MM = 20.0
 """Corners nearer to each other are united when a solid is made, which would move a common border."""
 _ROUNDING_MM = 1.5
 """Corners that rounding adds lie within this of a straight edge."""
-GAP_MM = 1000.0
-"""Two outlines may leave a slit up to this width: no wider than the cells that show whether ground lies in it."""
-_FACING_MM = 500.0
-"""A slit runs at least this far along both outlines."""
 _MITRE = 6.0
 """Offset corners sharper than 20 degrees are cut."""
 
@@ -69,63 +65,6 @@ class Claim:
         return -float(np.median(self.points_mm[:, 2])) if len(self.points_mm) else 0.0, self.name
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Slit:
-    """An area between two outlines that face each other."""
-
-    area_mm: Polygon
-    """Integer millimetres."""
-    strips_mm: tuple[Polygon, Polygon]
-    """What the first, or the second, covers in addition if it moves its whole edge up to the other; at least the area."""
-
-
-def slits(first_mm: MultiPolygon, second_mm: MultiPolygon, within: shapely.Geometry) -> list[Slit]:
-    """The slits of up to `GAP_MM` between two outlines, as far as they lie within an area."""
-    outlines = first_mm, second_mm
-    both, *alone = (_closed(area) for area in (shapely.union_all(outlines), *outlines))
-    between = shapely.difference(both, shapely.union_all([*outlines, *alone], grid_size=1.0), grid_size=1.0)
-    found = []
-    for area in polygons_of(shapely.normalize(between)):
-        if min(_common_mm(area, outline) for outline in outlines) < _FACING_MM or not shapely.covers(within, area):
-            continue
-        mine, other = (_strip(area, *pair) for pair in (outlines, outlines[::-1]))
-        strips = (mine if shapely.covers(within, mine) else area, other if shapely.covers(within, other) else area)
-        found.append(Slit(area_mm=area, strips_mm=strips))
-    return found
-
-
-def _strip(area: Polygon, own: MultiPolygon, other: MultiPolygon) -> Polygon:
-    """What an outline covers in addition if its edge beside a slit moves, parallel to itself, up to the other one."""
-    ring = shapely.get_coordinates(area.exterior)
-    edges = np.diff(ring, axis=0)
-    middles = shapely.points(0.5 * (ring[1:] + ring[:-1]))
-    lengths = np.hypot(edges[:, 0], edges[:, 1])
-    beside = np.where(shapely.dwithin(middles, own, _ROUNDING_MM), lengths, 0.0)
-    if not beside.any():
-        return area
-    along = edges[np.argmax(beside)] / beside.max()
-    # the slit lies to the right of its own ring, which runs clockwise
-    across = np.array([along[1], -along[0]])
-    offset = ring @ across
-    moved = np.rint(across * (offset.max() - offset.min()))
-    swept = shapely.union_all([shapely.transform(own, lambda xy: xy + moved), area], grid_size=1.0)
-    added = shapely.difference(swept, shapely.union_all([own, other], grid_size=1.0), grid_size=1.0)
-    return next((piece for piece in polygons_of(added) if shapely.intersects(piece, shapely.point_on_surface(area))), area)
-
-
-def _closed(area: shapely.Geometry) -> shapely.Geometry:
-    """An area with what lies between parts of it that are less than `GAP_MM` apart."""
-    wide = shapely.buffer(area, 0.5 * GAP_MM, join_style="mitre", mitre_limit=_MITRE)
-    narrow = shapely.buffer(wide, -0.5 * GAP_MM, join_style="mitre", mitre_limit=_MITRE)
-    return shapely.set_precision(narrow, 1.0)
-
-
-def _common_mm(piece: Polygon, outline_mm: MultiPolygon) -> float:
-    """How far the border of a piece runs along an outline, within the rounding."""
-    beside = shapely.buffer(outline_mm, _ROUNDING_MM, join_style="mitre")
-    return float(shapely.length(shapely.intersection(piece.exterior, beside)))
-
-
 def divided(first: Claim, second: Claim) -> tuple[list[Polygon], list[Polygon]]:
     """The parts of the overlap of two outlines that the first keeps, and those that the second keeps.
 
@@ -145,27 +84,6 @@ def divided(first: Claim, second: Claim) -> tuple[list[Polygon], list[Polygon]]:
     return kept
 
 
-def closed(first: Claim, second: Claim, between: Sequence[Slit]) -> tuple[list[Polygon], list[Polygon]]:
-    """What the first takes of the slits beside the second, and what the second takes, by the least cost."""
-    taken: tuple[list[Polygon], list[Polygon]] = ([], [])
-    for k, slit in enumerate(between):
-        others = MultiPolygon([*taken[0], *taken[1], *(other.area_mm for other in between[k + 1 :])])
-        options = [(0, slit.area_mm), (1, slit.area_mm)]
-        options += [(side, strip) for side, strip in enumerate(slit.strips_mm) if not _overlap(strip, others)]
-        costs = []
-        for side, area in options:
-            outline = (first, second)[side].outline_mm
-            grown = shapely.union_all([outline, *taken[side], area], grid_size=1.0)
-            costs.append(_effort(grown) - _effort(outline))
-        side, area = options[int(np.argmin(costs))]
-        taken[side].append(area)
-    return taken
-
-
-def _overlap(area: Polygon, others: MultiPolygon) -> bool:
-    return bool(shapely.area(shapely.intersection(area, others)) > 0.0)
-
-
 def _shares(piece: Polygon, first: Claim, second: Claim) -> tuple[list[Polygon], list[Polygon]]:
     """The shares of both in one piece of their overlap, by the least cost; of equal ones the first is taken."""
     own, other = _inside(piece, first.points_mm), _inside(piece, second.points_mm)
@@ -177,7 +95,7 @@ def _shares(piece: Polygon, first: Claim, second: Claim) -> tuple[list[Polygon],
         cost = _WRONG_COST * wrong
         for claim, lost in ((first, theirs), (second, mine)):
             left = shapely.difference(claim.outline_mm, MultiPolygon(lost), grid_size=1.0) if lost else claim.outline_mm
-            cost += _effort(left) + (_BARRED if left.area < _KEPT_SHARE * claim.outline_mm.area else 0.0)
+            cost += effort(left) + (_BARRED if left.area < _KEPT_SHARE * claim.outline_mm.area else 0.0)
         costs.append(cost)
     mine, theirs, _ = options[int(np.argmin(costs))]
     return mine, theirs
@@ -217,7 +135,7 @@ def _chords(piece: Polygon, own: IntArray, other: IntArray) -> Iterator[tuple[li
         yield (near, far, wrong) if behind[best] > 0.5 * sign.sum() else (far, near, wrong)
 
 
-def _effort(area: shapely.Geometry) -> float:
+def effort(area: shapely.Geometry) -> float:
     """What it takes to describe an area: its corners; acute ones, short edges and parts cost more."""
     cost = 0.0
     for polygon in polygons_of(area):

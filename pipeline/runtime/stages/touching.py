@@ -22,9 +22,10 @@ from pipeline.errors import BuildingError, GableworkError
 from pipeline.io.gps_time import GpsTimeKind
 from pipeline.model import IntArray
 from pipeline.prepared_cloud import prepare_cloud
-from pipeline.roof.disjoint_outlines import GAP_MM, Claim, Slit, closed, divided, left_of, slits
+from pipeline.roof.disjoint_outlines import Claim, divided, left_of
 from pipeline.roof.plan import drawn_outline, roof_points
 from pipeline.roof.roof_settings import RoofSettings
+from pipeline.roof.slits import GAP_MM, Slit, between, closed, slits
 from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import OpenScratch, Scratch
 from pipeline.runtime.scratch.outcomes import Files, InParts, Place, brief_within, drop_outcomes, key_of
@@ -162,23 +163,20 @@ def _outlines_of(
 
     What fails without a known reason leaves its candidates as they are drawn alone, with a warning.
     """
-    pairs = near_pairs(sites)
-    pairs = pairs[pairs[:, 0] < owned]
+    all_pairs = near_pairs(sites)
+    pairs = all_pairs[all_pairs[:, 0] < owned]
     drawn: dict[int, MultiPolygon] = {}
     for k in np.unique(pairs).tolist():
         task.scratch.check_cancelled()
         outline_mm = _or_warned(warnings, (sites[k],), functools.partial(_drawn_mm, sites[k], task))
         if outline_mm is not None:
             drawn[k] = outline_mm
-    known = np.array([i in drawn and j in drawn for i, j in pairs.tolist()], np.bool_)
-    pairs = pairs[known]
-    first, second = (np.array([drawn[k] for k in column.tolist()], object) for column in pairs.T)
-    near = shapely.dwithin(first, second, _BESIDE_MM)
-    facing = [
-        tuple(sorted(pair, key=lambda k: sites[k].building_id))
-        for pair in pairs[shapely.dwithin(first, second, GAP_MM)].tolist()
-    ]
-    between = _slits(facing, sites, drawn, task, warnings)
+    all_pairs = np.array([(i, j) for i, j in all_pairs.tolist() if i in drawn and j in drawn], np.int64).reshape(-1, 2)
+    first, second = (np.array([drawn[k] for k in column.tolist()], object) for column in all_pairs.T)
+    is_own = all_pairs[:, 0] < owned
+    near = all_pairs[is_own & shapely.dwithin(first, second, _BESIDE_MM)]
+    is_facing = shapely.dwithin(first, second, GAP_MM)
+    found = _slits(all_pairs[is_facing].tolist(), sites, drawn, task, warnings)
 
     @functools.lru_cache(maxsize=_HELD)
     def claim(k: int) -> Claim:
@@ -192,18 +190,18 @@ def _outlines_of(
     def divide(i: int, j: int) -> None:
         (of_i, of_j), (more_of_i, more_of_j) = (
             divided(claim(i), claim(j)),
-            closed(claim(i), claim(j), between[i, j]),
+            closed(drawn[i], drawn[j], found[i, j]),
         )
         kept[i] += of_i + more_of_i
         lost[i] += of_j
         kept[j] += of_j + more_of_j
         lost[j] += of_i
 
-    for i, j in facing:
+    for i, j in (pair for pair in found if min(pair) < owned):
         task.scratch.check_cancelled()
         _or_warned(warnings, (sites[i], sites[j]), functools.partial(divide, i, j))
     outlines = {}
-    for k in np.unique(pairs[near]).tolist():
+    for k in np.unique(near).tolist():
         if k < owned:
             cut = functools.partial(left_of, drawn[k], kept[k], lost[k], task.roof.min_part_area_m2)
             apart = _or_warned(warnings, (sites[k],), cut)
@@ -212,41 +210,45 @@ def _outlines_of(
 
 
 def _slits(
-    pairs: Sequence[tuple[int, int]],
+    pairs: Sequence[Sequence[int]],
     sites: Sequence[CandidateSite],
     drawn: Mapping[int, MultiPolygon],
     task: TouchTask,
     warnings: list[str],
-) -> dict[tuple[int, int], list[Slit]]:
-    """The slits between pairs of outlines that a wall or a roof fills, by pair: points lie in them, but no ground; those narrower than
-    the point spacing may be empty.
+) -> dict[tuple[int, ...], list[Slit]]:
+    """The slits between pairs of outlines that a wall or a roof fills, by pair: points lie in them, but no ground.
 
-    None lies beside a third outline. A task knows all outlines that reach into the boxes of both, so another task finds
-    the same slits.
+    Those narrower than the point spacing may be empty. A task knows all outlines that reach into the boxes of both, so
+    another task finds the same slits.
     """
-    found: dict[tuple[int, int], list[Slit]] = {}
-    for pair in pairs:
-        between = functools.partial(slits, *(drawn[k] for k in pair), _beside_two(pair, sites, drawn))
-        found[pair] = _or_warned(warnings, [sites[k] for k in pair], between) or []
-    areas = np.array([slit.area_mm for pair in pairs for slit in found[pair]], object)
-    heights = iter(_heights_in(areas, task) if len(areas) else ())
-    return {pair: [slit for slit in found[pair] if _is_built(slit, next(heights), pair, sites, drawn)] for pair in pairs}
+    ordered = [tuple(sorted(pair, key=lambda k: sites[k].building_id)) for pair in pairs]
 
+    def of_pair(i: int, j: int) -> list[Slit]:
+        if not around[i, j]:
+            return []
+        known = shapely.intersection(*(shapely.box(*(sites[k].reach_mm or ())) for k in (i, j)))
+        third = [outline for k, outline in drawn.items() if k not in (i, j) and outline.intersects(known)]
+        others = [area for pair, areas in around.items() if pair != (i, j) for area in areas if area.intersects(known)]
+        return slits((drawn[i], drawn[j]), around[i, j], shapely.buffer(known, -GAP_MM), third, others)
 
-def _beside_two(
-    pair: tuple[int, int], sites: Sequence[CandidateSite], drawn: Mapping[int, MultiPolygon]
-) -> shapely.Geometry:
-    """Where all outlines are known to the tasks of two candidates, and no third one is near."""
-    known = shapely.intersection(*(shapely.box(*(sites[k].reach_mm or ())) for k in pair))
-    third = [outline for k, outline in drawn.items() if k not in pair and outline.intersects(known)]
-    beside = shapely.buffer(shapely.union_all(third), GAP_MM, join_style="mitre")
-    return shapely.difference(shapely.buffer(known, -GAP_MM), beside)
+    around = {}
+    for i, j in ordered:
+        areas = functools.partial(between, drawn[i], drawn[j])
+        around[i, j] = _or_warned(warnings, (sites[i], sites[j]), areas) or []
+    found = {}
+    for i, j in ordered:
+        found[i, j] = _or_warned(warnings, (sites[i], sites[j]), functools.partial(of_pair, i, j)) or []
+    areas_mm = np.array([slit.area_mm for pair in ordered for slit in found[pair]], object)
+    heights = iter(_heights_in(areas_mm, task) if len(areas_mm) else ())
+    return {
+        pair: [slit for slit in found[pair] if _is_built(slit, next(heights), pair, sites, drawn)] for pair in ordered
+    }
 
 
 def _is_built(
     slit: Slit,
     heights_mm: IntArray,
-    pair: tuple[int, int],
+    pair: Sequence[int],
     sites: Sequence[CandidateSite],
     drawn: Mapping[int, MultiPolygon],
 ) -> bool:
