@@ -51,7 +51,7 @@ def slits(
     third_mm: Sequence[MultiPolygon],
     of_others: Sequence[Polygon],
 ) -> list[Slit]:
-    """The slits of some areas between two outlines, apart from third outlines and from the areas between other pairs."""
+    """The slits of some areas between two outlines, apart from third outlines and from areas between other pairs."""
     taken = shapely.union_all([*third_mm, *of_others], grid_size=1.0)
     beside = shapely.buffer(shapely.union_all(third_mm), GAP_MM, join_style="mitre")
     free = shapely.difference(within, shapely.union_all([beside, *of_others]))
@@ -100,20 +100,23 @@ def _common_mm(piece: Polygon, outline_mm: MultiPolygon) -> float:
 
 
 def closed(
-    first_mm: MultiPolygon, second_mm: MultiPolygon, between: Sequence[Slit]
+    first_mm: MultiPolygon, second_mm: MultiPolygon, found: Sequence[Slit]
 ) -> tuple[list[Polygon], list[Polygon]]:
-    """What the first takes of the slits beside the second, and what the second takes, by the least cost."""
+    """What the first takes of the slits beside the second, and what the second takes.
+
+    It is what takes least to describe, then the least area.
+    """
     taken: tuple[list[Polygon], list[Polygon]] = ([], [])
-    for k, slit in enumerate(between):
-        others = MultiPolygon([*taken[0], *taken[1], *(other.area_mm for other in between[k + 1 :])])
+    for number, slit in enumerate(found):
+        others = MultiPolygon([*taken[0], *taken[1], *(other.area_mm for other in found[number + 1 :])])
         options = [(0, slit.area_mm), (1, slit.area_mm)]
         options += [(side, strip) for side, strip in enumerate(slit.strips_mm) if not _overlap(strip, others)]
         costs = []
-        for side, area in options:
+        for k, (side, area) in enumerate(options):
             outline = (first_mm, second_mm)[side]
             grown = shapely.union_all([outline, *taken[side], area], grid_size=1.0)
-            costs.append(effort(grown) - effort(outline))
-        side, area = options[int(np.argmin(costs))]
+            costs.append((effort(grown) - effort(outline), area.area, k))
+        side, area = options[min(costs)[2]]
         taken[side].append(area)
     return taken
 

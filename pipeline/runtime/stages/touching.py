@@ -14,7 +14,6 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TypeVar
 
 import numpy as np
-import numpy.typing as npt
 import shapely
 from shapely import MultiPolygon
 
@@ -215,13 +214,13 @@ def _slits(
     drawn: Mapping[int, MultiPolygon],
     task: TouchTask,
     warnings: list[str],
-) -> dict[tuple[int, ...], list[Slit]]:
+) -> dict[tuple[int, int], list[Slit]]:
     """The slits between pairs of outlines that a wall or a roof fills, by pair: points lie in them, but no ground.
 
     Those narrower than the point spacing may be empty. A task knows all outlines that reach into the boxes of both, so
     another task finds the same slits.
     """
-    ordered = [tuple(sorted(pair, key=lambda k: sites[k].building_id)) for pair in pairs]
+    ordered = [(j, i) if sites[j].building_id < sites[i].building_id else (i, j) for i, j in pairs]
 
     def of_pair(i: int, j: int) -> list[Slit]:
         if not around[i, j]:
@@ -238,8 +237,8 @@ def _slits(
     found = {}
     for i, j in ordered:
         found[i, j] = _or_warned(warnings, (sites[i], sites[j]), functools.partial(of_pair, i, j)) or []
-    areas_mm = np.array([slit.area_mm for pair in ordered for slit in found[pair]], object)
-    heights = iter(_heights_in(areas_mm, task) if len(areas_mm) else ())
+    areas_mm = [slit.area_mm for pair in ordered for slit in found[pair]]
+    heights = iter(_heights_in(areas_mm, task) if areas_mm else ())
     return {
         pair: [slit for slit in found[pair] if _is_built(slit, next(heights), pair, sites, drawn)] for pair in ordered
     }
@@ -259,7 +258,7 @@ def _is_built(
     return len(heights_mm) >= least and bool(np.count_nonzero(is_ground) <= _MOST_GROUND * len(heights_mm))
 
 
-def _heights_in(areas_mm: npt.NDArray[np.object_], task: TouchTask) -> list[IntArray]:
+def _heights_in(areas_mm: Sequence[shapely.Polygon], task: TouchTask) -> list[IntArray]:
     """The heights of the points in some areas above the terrain, of single and last returns, millimetres, by area."""
     west, south, east, north = (round(value) for value in shapely.total_bounds(areas_mm))
     around = surroundings_of(task.scratch, task.grid, Window(x0_mm=west, y0_mm=south, x1_mm=east + 1, y1_mm=north + 1))

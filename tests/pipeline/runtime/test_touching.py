@@ -55,6 +55,32 @@ def test_sheds_that_touch_have_disjoint_outlines_in_any_tiles(
         assert reconstruct(sheds, settings={**TRUSTED, **tiles}).digest == whole.digest
 
 
+@pytest.mark.parametrize(("seen_m", "touch"), [(3.0, True), (0.0, False), (None, False)])
+def test_a_slit_is_closed_where_something_but_no_ground_was_seen_in_it(
+    seen_m: float | None, touch: bool, tmp_path: Path, reconstruct: Callable[..., RunSummary]
+) -> None:
+    """Two houses half a metre apart; points in the slit lie so high above the ground, or there are none."""
+    random = np.random.default_rng(5)
+    x, y = random.uniform(0.0, 50.0, (2, 20_000))
+    z, kind = np.full(len(x), 50.0), np.full(len(x), 2, np.uint8)
+    for x0, y0, x1, y1, top in ((12.0, 12.0, 22.0, 20.0, 60.0), (22.9, 14.0, 30.0, 24.0, 56.0)):
+        inside = (x > x0) & (x < x1) & (y > y0) & (y < y1)
+        z[inside], kind[inside] = top, 6
+    slit = (x >= 22.0) & (x <= 22.9) & (y > 14.0) & (y < 20.0)
+    z[slit], kind[slit] = 50.0 + (seen_m or 0.0), 2 if seen_m == 0.0 else 1
+    keep = ~slit if seen_m is None else np.ones(len(x), np.bool_)
+    z += random.normal(0.0, 0.02, len(x))
+    found = Houses(xyz=np.column_stack((x + 4e5, y + 5.7e6, z))[keep], house=np.zeros(np.count_nonzero(keep), np.int8))
+    cloud = write_houses(tmp_path / "slit.laz", found, classes=kind[keep])
+    whole = reconstruct(cloud, settings={**TRUSTED, "tile_size_m": 1000.0})
+    outlines = [shapely.force_2d(shapely.from_wkb(row["geometry"])) for row in rows(whole.run_dir)]
+    assert len(outlines) == 2
+    assert (shapely.distance(*outlines) < 0.002) == touch
+    assert shapely.intersection(*outlines).area < 0.002
+    tiles = {"tile_size_m": 24.0, "lattice_x_m": 11.3, "lattice_y_m": 3.0}
+    assert reconstruct(cloud, settings={**TRUSTED, **tiles}).digest == whole.digest
+
+
 def test_a_second_run_in_a_work_folder_draws_nothing_again(
     sheds: Path, tmp_path: Path, reconstruct: Callable[..., RunSummary]
 ) -> None:
