@@ -38,6 +38,10 @@ _SMEARED_SHARE = 0.1
 """Share of a sliver's points that misfit its own plane from which on they are those of a wall, smeared by the beam: the
 points of a parapet's top fit it, those of a wall are spread over its height."""
 
+_LOW_SHARE = 0.5
+"""Share of a sliver's points that must misfit each neighbour's plane for it to be a parapet: others are no higher than
+the roof."""
+
 
 @kernel
 def cells_of_points(plan: Subdivision, points: FloatArray) -> IntArray:
@@ -341,6 +345,9 @@ def unite_faces(
             sliver = -1
         else:
             is_fitted = _fitted(data, label_of, inside)
+            for s in range(len(keys)):
+                f, g = keys[s] // count, keys[s] % count
+                is_fitted[f] &= data[f, label_of[g]] >= _LOW_SHARE * COST_SCALE * inside[f]
             sliver = _narrowest_sliver(plan, areas, faces, is_fitted, limits.min_face_width_m)
             if sliver < 0:
                 return
