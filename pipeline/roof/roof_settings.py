@@ -256,7 +256,8 @@ class ArrangementSettings(Parameters):
     )
     min_face_width_m: float = parameter(
         0.5,
-        "A narrower sliver is not a roof face: gutters, low rims, the smeared edge of a wall. Parapets on the outline stay.",
+        "A narrower sliver is not a roof face: gutters, low rims, the smeared edge of a wall. A parapet on the outline "
+        "stays.",
         unit="m",
         minimum=0.0,
         maximum=2.0,
