@@ -303,10 +303,10 @@ def may_join(kind: KindArray, sums: IntArray, faults: KindArray, settings: Candi
     small_roof &= f["top_m"] >= settings.min_height_m
     small_roof &= f["planar_share"] >= settings.min_planar_share
     small_roof &= f["canopy_share"] <= settings.max_canopy_share
-    roof_like = (faults == Fault.NONE) | small_roof
-    joins: BoolArray = roof_like & (f["step_share"] >= settings.unite_share)
-    by_class = (kind == FacetKind.BUILDING) & (faults == Fault.TOO_SMALL)
-    joins |= (roof_like | by_class) & (f["seam_m"] >= _LEAST_SEAM_M)
+    # classified points are not judged by their surroundings
+    small_roof |= (kind == FacetKind.BUILDING) & (faults == Fault.TOO_SMALL)
+    joins: BoolArray = (faults == Fault.NONE) | small_roof
+    joins &= (f["step_share"] >= settings.unite_share) | (f["seam_m"] >= _LEAST_SEAM_M)
     return np.isin(kind, (FacetKind.OBJECT, FacetKind.BUILDING)) & joins
 
 
