@@ -98,6 +98,25 @@ def _turns(directions: FloatArray, prices: Prices) -> FloatArray:
     return turns
 
 
+@kernel(inline="always")
+def _own_direction(moments: tuple[float, float, float], cx: float, cy: float) -> tuple[float, float]:
+    """The angle of the line through a stretch with moments xx, xy and yy, and how far its chord goes along it."""
+    sxx, sxy, syy = moments
+    angle = 0.5 * math.atan2(2.0 * sxy, sxx - syy)
+    along = math.cos(angle) * cx + math.sin(angle) * cy
+    return angle if along >= 0.0 else angle + math.pi, along
+
+
+@kernel(inline="always")
+def _turn(best: FloatArray, turns: FloatArray, before: FloatArray, through: IntArray) -> None:
+    """Fill in the best description before an edge in each state (2 d + 1,), and the state of the edge before it."""
+    for b in range(len(best)):
+        for a in range(len(best)):
+            total = best[a] + turns[a, b]
+            if total < before[b]:
+                before[b], through[b] = total, a
+
+
 @kernel
 def least_description(
     border: FloatArray, breaks: IntArray, directions: FloatArray, per_mm: float, prices: Prices
@@ -164,6 +183,7 @@ def least_description(
                     off = sines[k] * sines[k] * sxx - 2.0 * sines[k] * cosines[k] * sxy + cosines[k] * cosines[k] * syy
                     along = cosines[k] * cx + sines[k] * cy
                     state = 2 * k if along >= 0.0 else 2 * k + 1
+                    angle = directions[k] if along >= 0.0 else directions[k] + math.pi
                 else:
                     off = 0.5 * (sxx + syy) - math.sqrt(0.25 * (sxx - syy) ** 2 + sxy * sxy)
                 unexplained = before[i, state] + scale * max(off, 0.0)
@@ -171,13 +191,8 @@ def least_description(
                 total = unexplained + (prices.edge if k < d else prices.edge + prices.free)
                 if total > best[j, state]:
                     continue
-                if k < d:
-                    angle = directions[k] if along >= 0.0 else directions[k] + math.pi
-                else:
-                    angle = 0.5 * math.atan2(2.0 * sxy, sxx - syy)
-                    along = math.cos(angle) * cx + math.sin(angle) * cy
-                    if along < 0.0:
-                        angle += math.pi
+                if k == d:
+                    angle, along = _own_direction((sxx, sxy, syy), cx, cy)
                 if abs(along) < _LEAST_PROGRESS * w:
                     continue
                 last = through[i, state]
@@ -188,11 +203,7 @@ def least_description(
                     continue
                 best[j, state], start[j, state], came[j, state], angles[j, state] = total, i, last, angle
         least = np.min(best[j])
-        for b in range(free + 1):
-            for a in range(free + 1):
-                total = best[j, a] + turns[a, b]
-                if total < before[j, b]:
-                    before[j, b], through[j, b] = total, a
+        _turn(best[j], turns, before[j], through[j])
         kept = 0
         for place in range(alive):
             if reached[place] <= least + spare:
