@@ -80,6 +80,11 @@ class RoofPoints:
     facades: FacadePoints | None = None
     """Points that show the walls beneath; None where no wall is asked for."""
 
+    @property
+    def limit_mm(self) -> MultiPolygon | None:
+        """What the model stays within: the drawn outline, unless guides change it; integer millimetres."""
+        return None if self.guides else self.outline_mm
+
     @classmethod
     def none(cls, footprint: Polygon | MultiPolygon | None) -> RoofPoints:
         """No points in a given footprint, in local metres; their spacing is nan."""
@@ -122,7 +127,7 @@ def roof_points(cloud: PreparedCloud, settings: RoofSettings, decisions: list[De
         split=_are_among(xy_mm, candidate.split_returns),
         spacing_m=min(max(spacing_over_area_m(points), _MIN_SPACING_M), _MAX_SPACING_M),
         footprint_mm=_in_mm(candidate.footprint),
-        outline_mm=_in_mm(candidate.outline),
+        outline_mm=_outline_in_mm(candidate.outline),
         facades=_facades(candidate, points) if settings.at_walls or settings.finds_walls else None,
     )
 
@@ -134,6 +139,19 @@ def _in_mm(footprint: Polygon | MultiPolygon | None) -> MultiPolygon | None:
     from pipeline.roof.footprint_in_mm import footprint_in_mm
 
     return footprint_in_mm(footprint)
+
+
+def _outline_in_mm(outline: MultiPolygon | None) -> MultiPolygon | None:
+    """An outline drawn with regard to others in integer millimetres, with every vertex: others have them, too.
+
+    Raises BuildingError `no_footprint` where others took all of it.
+    """
+    if outline is None:
+        return None
+    if outline.is_empty:
+        raise BuildingError(Reason.NO_FOOTPRINT, "higher or larger buildings cover all of its outline")
+    in_mm: MultiPolygon = shapely.transform(outline, lambda xy: np.rint(xy * 1e3))
+    return in_mm
 
 
 def _facades(candidate: Candidate, points: FloatArray) -> FacadePoints:

@@ -48,6 +48,8 @@ STAGE = "touching"
 _BESIDE_MM = 2000.0
 """An outline that ends so near to another one stays as it was compared: with the hidden points at walls, which are
 known when it is modelled, it could become that much larger."""
+_CLOSE_MM = 2.0
+"""Outlines this near may overlap once their corners are rounded."""
 _HELD = 16
 """Candidates whose points stay in memory from one overlap to the next."""
 
@@ -166,7 +168,7 @@ def _outlines_of(
     pairs = pairs[known]
     first, second = (np.array([drawn[k] for k in column.tolist()], object) for column in pairs.T)
     near = shapely.dwithin(first, second, _BESIDE_MM)
-    overlapping = shapely.intersects(first, second)
+    close = shapely.dwithin(first, second, _CLOSE_MM)
 
     @functools.lru_cache(maxsize=_HELD)
     def claim(k: int) -> Claim:
@@ -174,25 +176,22 @@ def _outlines_of(
         places: IntArray = np.column_stack([points[axis] for axis in "xyz"]).astype(np.int64)
         return Claim(name=sites[k].building_id, outline_mm=drawn[k], points_mm=places)
 
-    def of_pair(i: int, j: int) -> tuple[list[shapely.Polygon], list[shapely.Polygon]]:
+    def of_pair(i: int, j: int) -> tuple[MultiPolygon, MultiPolygon]:
         return divided(claim(i), claim(j))
 
-    kept: dict[int, list[shapely.Polygon]] = collections.defaultdict(list)
-    lost: dict[int, list[shapely.Polygon]] = collections.defaultdict(list)
-    for i, j in pairs[overlapping].tolist():
+    # other units of its block were not compared with a unit: it keeps within its part of the block
+    kept = {k: [shape] if sites[k].block is not None else [] for k, shape in drawn.items()}
+    for i, j in pairs[close].tolist():
         task.scratch.check_cancelled()
         parts = _or_warned(warnings, (sites[i], sites[j]), functools.partial(of_pair, i, j))
         if parts is None:
             continue
-        of_first, of_second = parts
-        kept[i] += of_first
-        lost[i] += of_second
-        kept[j] += of_second
-        lost[j] += of_first
+        kept[i].append(parts[0])
+        kept[j].append(parts[1])
     outlines = {}
     for k in np.unique(pairs[near]).tolist():
         if k < owned:
-            cut = functools.partial(left_of, drawn[k], kept[k], lost[k], task.roof.min_part_area_m2)
+            cut = functools.partial(left_of, drawn[k], kept[k], task.roof.min_part_area_m2)
             apart = _or_warned(warnings, (sites[k],), cut)
             outlines[sites[k].building_id] = shapely.transform(drawn[k] if apart is None else apart, lambda xy: xy / MM)
     return outlines
