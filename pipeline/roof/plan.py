@@ -73,17 +73,14 @@ class RoofPoints:
     """The given footprint in integer millimetres."""
     outline_mm: MultiPolygon | None = None
     """The outline that was drawn with regard to touching units and candidates; integer millimetres."""
+    limit_mm: MultiPolygon | None = None
+    """The same with vertices that hardly bend it, which others have, too: solids stay within it."""
     guides: tuple[Guide, ...] = ()
     """Given lines, local metres."""
     guide_distance_m: float = 0.0
     """How far lines and edges may lie from a guide that takes their place."""
     facades: FacadePoints | None = None
     """Points that show the walls beneath; None where no wall is asked for."""
-
-    @property
-    def limit_mm(self) -> MultiPolygon | None:
-        """What the model stays within: the drawn outline, unless guides change it; integer millimetres."""
-        return None if self.guides else self.outline_mm
 
     @classmethod
     def none(cls, footprint: Polygon | MultiPolygon | None) -> RoofPoints:
@@ -127,7 +124,8 @@ def roof_points(cloud: PreparedCloud, settings: RoofSettings, decisions: list[De
         split=_are_among(xy_mm, candidate.split_returns),
         spacing_m=min(max(spacing_over_area_m(points), _MIN_SPACING_M), _MAX_SPACING_M),
         footprint_mm=_in_mm(candidate.footprint),
-        outline_mm=_outline_in_mm(candidate.outline),
+        limit_mm=_limit_in_mm(candidate),
+        outline_mm=_in_mm(candidate.outline),
         facades=_facades(candidate, points) if settings.at_walls or settings.finds_walls else None,
     )
 
@@ -141,16 +139,16 @@ def _in_mm(footprint: Polygon | MultiPolygon | None) -> MultiPolygon | None:
     return footprint_in_mm(footprint)
 
 
-def _outline_in_mm(outline: MultiPolygon | None) -> MultiPolygon | None:
-    """An outline drawn with regard to others in integer millimetres, with every vertex: others have them, too.
+def _limit_in_mm(candidate: Candidate) -> MultiPolygon | None:
+    """The drawn outline with every vertex, in integer millimetres; None where guides change it, or without one.
 
     Raises BuildingError `no_footprint` where others took all of it.
     """
-    if outline is None:
+    if candidate.outline is None or candidate.guides:
         return None
-    if outline.is_empty:
-        raise BuildingError(Reason.NO_FOOTPRINT, "higher or larger buildings cover all of its outline")
-    in_mm: MultiPolygon = shapely.transform(outline, lambda xy: np.rint(xy * 1e3))
+    if candidate.outline.is_empty:
+        raise BuildingError(Reason.NO_FOOTPRINT, "others that touch it cover all of its outline")
+    in_mm: MultiPolygon = shapely.transform(candidate.outline, lambda xy: np.rint(xy * 1e3))
     return in_mm
 
 
