@@ -249,7 +249,7 @@ def _traced_plan(roof: RoofPoints, planes: Sequence[Plane], settings: RoofSettin
     if given is not None:
         return RoofPlan(planes=tuple(planes), faces=partition, outline_mm=given, raw=None)
     around = outline(partition)
-    if not settings.straight_eaves:
+    if not settings.straight_eaves and roof.outline_mm is None:
         return RoofPlan(planes=tuple(planes), faces=partition, outline_mm=around, raw=partition)
     faces = partition
     if continued:
@@ -281,7 +281,7 @@ def drawn_outline(roof: RoofPoints, settings: RoofSettings) -> MultiPolygon:
     if roof.footprint_mm is not None:
         _require_extent(float(np.ptp(shapely.get_coordinates(roof.footprint_mm), axis=0).max()) * 1e-3)
         return roof.footprint_mm
-    if roof.outline_mm is not None and settings.straight_eaves:
+    if roof.outline_mm is not None:
         return roof.outline_mm
     z = np.sort(roof.points[:, 2])
     level = Plane(a=0.0, b=0.0, c=float(z[len(z) // 2]), n_points=len(z), rmse_m=0.0)
