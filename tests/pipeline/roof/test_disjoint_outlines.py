@@ -68,6 +68,14 @@ def test_two_sheds_that_touch_share_one_straight_wall() -> None:
         assert shapely.contains_xy(one, shed.points_mm[:, 0], shed.points_mm[:, 1]).mean() > 0.85
 
 
+def test_turned_sheds_that_touch_have_the_same_corners_along_their_wall() -> None:
+    boxes = shapely.box(0, 0, 6, 4), shapely.box(6.1, 0.7, 12, 5), shapely.box(3, 4.1, 9, 9)
+    outlines = resolved([claim(str(k), rotate(box, 23.0, origin=(0, 0)), 3.0 + k) for k, box in enumerate(boxes)])
+    assert overlap_m2(outlines) == 0.0
+    for one, other in itertools.combinations(outlines, 2):
+        assert shapely.coverage_is_valid([*one.geoms, *other.geoms])
+
+
 def test_the_order_of_two_candidates_does_not_matter() -> None:
     first = claim("a", shapely.box(0, 0, 6, 4), 3.0)
     second = claim("b", rotate(shapely.box(5, 1, 12, 5), 23.0), 3.0)
