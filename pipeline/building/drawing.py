@@ -6,7 +6,6 @@ import dataclasses
 import math
 
 import numpy as np
-import shapely
 
 from pipeline.methods import ReconstructSettings
 from pipeline.model import Candidate, Decision, Doubt, Plane, RoofType, Segmentation
@@ -67,10 +66,9 @@ def own_model(building: Building, segmentation: Segmentation, roof: RoofPoints, 
         planes = drawn.planes
     if segmentation.faces is not None:  # a primitive is one form: with a side made level it would be another
         parts = large_parts(solid_parts(drawn, list(planes), ground_z_m, roof.limit_mm), settings.min_part_area_m2)
-        flush = [extra("unite_flush_walls")(part) for part in parts]
         return DrawnModel(
             lod="2.2",
-            parts=[one if _is_within(one, roof) else part for one, part in zip(flush, parts, strict=True)],
+            parts=[extra("unite_flush_walls")(part, roof.limit_mm) for part in parts],
             planes=list(planes),
             roof_type=segmentation.roof_type,
             bic_margin=margin,
@@ -104,12 +102,6 @@ def own_model(building: Building, segmentation: Segmentation, roof: RoofPoints, 
         whole = over(*level_unsupported_faces(drawn, roof, planes, ground_z_m, settings, ends=False))
         model = whole if _is_sound(whole) else model
     return model
-
-
-def _is_within(part: SolidPart, roof: RoofPoints) -> bool:
-    """Whether a part lies within the outline that others touch, if there is one."""
-    floor_mm = shapely.transform(part.footprint, lambda xy: np.rint(xy * 1e3))
-    return roof.limit_mm is None or bool(shapely.covers(roof.limit_mm, floor_mm))
 
 
 def _is_sound(model: DrawnModel) -> bool:

@@ -2,8 +2,9 @@
 
 Outlines drawn one by one end about half a point spacing outside of the outermost points, so those of two sheds that
 touch cross. The division of an overlap follows from the two outlines and their points alone, so two tasks decide alike,
-whatever the order and the tiles. A third outline changes nothing between the two. Everything is done in integer
-millimetres of the CRS. A border between two outlines has the same corners on both sides, except beside a third one.
+whatever the order and the tiles. A third outline changes nothing between the two: each keeps what it keeps beside all
+others, and places where such parts cross are rounded inward. Everything is done in integer millimetres of the CRS. A
+border between two outlines has the same corners on both sides, except beside a third one.
 """
 
 from __future__ import annotations

@@ -115,6 +115,11 @@ def roof_points(cloud: PreparedCloud, settings: RoofSettings, decisions: list[De
         decisions.append(Decision.check("roof_points", len(index), fewest))
     if len(index) < fewest:
         raise BuildingError(Reason.TOO_FEW_POINTS, f"{len(index)} roof points, fewer than {name} = {fewest}")
+    limit_mm = None
+    if candidate.outline is not None and not candidate.guides:  # guides change it
+        from pipeline.roof.within_outline import limit_in_mm
+
+        limit_mm = limit_in_mm(candidate.outline)
     xy_mm = cloud.points_mm.take(index, axis=0)[:, :2] + (cloud.shift_m[:2] * 1e3).astype(np.int64)
     return RoofPoints(
         points=points,
@@ -124,7 +129,7 @@ def roof_points(cloud: PreparedCloud, settings: RoofSettings, decisions: list[De
         split=_are_among(xy_mm, candidate.split_returns),
         spacing_m=min(max(spacing_over_area_m(points), _MIN_SPACING_M), _MAX_SPACING_M),
         footprint_mm=_in_mm(candidate.footprint),
-        limit_mm=_limit_in_mm(candidate),
+        limit_mm=limit_mm,
         outline_mm=_in_mm(candidate.outline),
         facades=_facades(candidate, points) if settings.at_walls or settings.finds_walls else None,
     )
@@ -137,19 +142,6 @@ def _in_mm(footprint: Polygon | MultiPolygon | None) -> MultiPolygon | None:
     from pipeline.roof.footprint_in_mm import footprint_in_mm
 
     return footprint_in_mm(footprint)
-
-
-def _limit_in_mm(candidate: Candidate) -> MultiPolygon | None:
-    """The drawn outline with every vertex, in integer millimetres; None where guides change it, or without one.
-
-    Raises BuildingError `no_footprint` where others took all of it.
-    """
-    if candidate.outline is None or candidate.guides:
-        return None
-    if candidate.outline.is_empty:
-        raise BuildingError(Reason.NO_FOOTPRINT, "others that touch it cover all of its outline")
-    in_mm: MultiPolygon = shapely.transform(candidate.outline, lambda xy: np.rint(xy * 1e3))
-    return in_mm
 
 
 def _facades(candidate: Candidate, points: FloatArray) -> FacadePoints:

@@ -38,6 +38,17 @@ _BACK_MM = 1.0
 XY = tuple[float, float]
 
 
+def limit_in_mm(outline: MultiPolygon) -> MultiPolygon:
+    """An outline drawn with regard to others, in metres on the millimetre grid, in millimetres with every vertex.
+
+    Raises BuildingError `no_footprint` where others took all of it.
+    """
+    if outline.is_empty:
+        raise BuildingError(Reason.NO_FOOTPRINT, "others that touch it take all of its outline")
+    in_mm: MultiPolygon = shapely.transform(outline, lambda xy: np.rint(xy * 1e3))
+    return in_mm
+
+
 def within_outline(partition: RoofPartition, outline_mm: MultiPolygon) -> RoofPartition:
     """A coverage in integer millimetres, within an outline; the same object if it was within.
 

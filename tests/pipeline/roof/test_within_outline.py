@@ -1,5 +1,7 @@
 """Roof faces within an outline that others touch: nothing outside, and hardly anything lost."""
 
+import itertools
+
 import numpy as np
 import pytest
 import shapely
@@ -96,7 +98,7 @@ def test_rounding_and_dropped_corners_lead_no_face_outside(
     outline_mm = MultiPolygon([bent])
     west, south, east, north = plain.bounds
     edges = [west - 1, *sorted({round(west + share * (east - west)) for share in shares}), east + 1]
-    strips = [shapely.box(a, south - 1, b, north + 1) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    strips = [shapely.box(a, south - 1, b, north + 1) for a, b in itertools.pairwise(edges)]
     net = shapely.union_all(shapely.boundary([plain, *strips]), grid_size=1.0)
     cells = polygons_of(shapely.polygonize(shapely.get_parts(net)))
     inside = [cell for cell in cells if shapely.contains(plain, shapely.point_on_surface(cell)) and cell.area > 1e4]
