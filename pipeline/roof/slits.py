@@ -121,5 +121,14 @@ def closed(
     return taken
 
 
+def without(area: Polygon, others: Sequence[shapely.Geometry]) -> list[Polygon]:
+    """An area apart from others by a millimetre, in integer millimetres."""
+    near = [other for other in others if shapely.dwithin(area, other, _ROUNDING_MM)]
+    if not near:
+        return [area]
+    wider = shapely.buffer(shapely.union_all(near, grid_size=1.0), _ROUNDING_MM, join_style="mitre")
+    return polygons_of(shapely.difference(area, wider, grid_size=1.0))
+
+
 def _overlap(area: Polygon, others: MultiPolygon) -> bool:
     return bool(shapely.area(shapely.intersection(area, others)) > 0.0)

@@ -22,9 +22,10 @@ from pipeline.io.gps_time import GpsTimeKind
 from pipeline.model import IntArray
 from pipeline.prepared_cloud import prepare_cloud
 from pipeline.roof.disjoint_outlines import Claim, divided, left_of
+from pipeline.roof.footprint import polygons_of
 from pipeline.roof.plan import drawn_outline, roof_points
 from pipeline.roof.roof_settings import RoofSettings
-from pipeline.roof.slits import GAP_MM, Slit, between, closed, slits
+from pipeline.roof.slits import GAP_MM, Slit, between, closed, slits, without
 from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import OpenScratch, Scratch
 from pipeline.runtime.scratch.outcomes import Files, InParts, Place, brief_within, drop_outcomes, key_of
@@ -52,6 +53,8 @@ STAGE = "touching"
 _BESIDE_MM = 2000.0
 """An outline that ends so near to another one stays as it was compared: with the hidden points at walls, which are
 known when it is modelled, it could become that much larger."""
+_CLOSE_MM = 2.0
+"""Outlines this near may overlap once their corners are rounded."""
 _LEAST_SEEN = 0.1
 """A slit is closed where it holds at least so much of the points that a roof as large would."""
 _MOST_GROUND, _GROUND_MM = 0.1, 1000
@@ -163,19 +166,18 @@ def _outlines_of(
     What fails without a known reason leaves its candidates as they are drawn alone, with a warning.
     """
     all_pairs = near_pairs(sites)
-    pairs = all_pairs[all_pairs[:, 0] < owned]
     drawn: dict[int, MultiPolygon] = {}
-    for k in np.unique(pairs).tolist():
+    for k in np.unique(all_pairs[all_pairs[:, 0] < owned]).tolist():
         task.scratch.check_cancelled()
         outline_mm = _or_warned(warnings, (sites[k],), functools.partial(_drawn_mm, sites[k], task))
         if outline_mm is not None:
             drawn[k] = outline_mm
     all_pairs = np.array([(i, j) for i, j in all_pairs.tolist() if i in drawn and j in drawn], np.int64).reshape(-1, 2)
     first, second = (np.array([drawn[k] for k in column.tolist()], object) for column in all_pairs.T)
+    taken = _taken(all_pairs[shapely.dwithin(first, second, GAP_MM)].tolist(), sites, drawn, task, warnings)
     is_own = all_pairs[:, 0] < owned
     near = all_pairs[is_own & shapely.dwithin(first, second, _BESIDE_MM)]
-    is_facing = shapely.dwithin(first, second, GAP_MM)
-    found = _slits(all_pairs[is_facing].tolist(), sites, drawn, task, warnings)
+    close = all_pairs[is_own & shapely.dwithin(first, second, _CLOSE_MM)]
 
     @functools.lru_cache(maxsize=_HELD)
     def claim(k: int) -> Claim:
@@ -183,29 +185,60 @@ def _outlines_of(
         places: IntArray = np.column_stack([points[axis] for axis in "xyz"]).astype(np.int64)
         return Claim(name=sites[k].building_id, outline_mm=drawn[k], points_mm=places)
 
-    kept: dict[int, list[shapely.Polygon]] = collections.defaultdict(list)
-    lost: dict[int, list[shapely.Polygon]] = collections.defaultdict(list)
-
-    def divide(i: int, j: int) -> None:
-        (of_i, of_j), (more_of_i, more_of_j) = (
-            divided(claim(i), claim(j)),
-            closed(drawn[i], drawn[j], found[i, j]),
+    def of_pair(i: int, j: int) -> tuple[MultiPolygon, MultiPolygon]:
+        first, second = (
+            dataclasses.replace(claim(k), outline_mm=_with(drawn[k], taken.get((k, other), ())))
+            for k, other in ((i, j), (j, i))
         )
-        kept[i] += of_i + more_of_i
-        lost[i] += of_j
-        kept[j] += of_j + more_of_j
-        lost[j] += of_i
+        return divided(first, second)
 
-    for i, j in (pair for pair in found if min(pair) < owned):
+    # other units of its block were not compared with a unit: it keeps within its part of the block
+    kept = {k: {k: shape} if sites[k].block is not None else {} for k, shape in drawn.items()}
+    for i, j in sorted({*map(tuple, close.tolist()), *((i, j) for i, j in taken if i < j and i < owned)}):
         task.scratch.check_cancelled()
-        _or_warned(warnings, (sites[i], sites[j]), functools.partial(divide, i, j))
+        parts = _or_warned(warnings, (sites[i], sites[j]), functools.partial(of_pair, i, j))
+        if parts is not None:
+            kept[i][j], kept[j][i] = parts
     outlines = {}
     for k in np.unique(near).tolist():
         if k < owned:
-            cut = functools.partial(left_of, drawn[k], kept[k], lost[k], task.roof.min_part_area_m2)
+            gained = {j: pieces for (of, j), pieces in taken.items() if of == k}
+            limits = [
+                _with(shape, [piece for other, pieces in gained.items() if other != j for piece in pieces])
+                for j, shape in kept[k].items()
+            ]
+            cut = functools.partial(left_of, drawn[k], limits, task.roof.min_part_area_m2)
             apart = _or_warned(warnings, (sites[k],), cut)
             outlines[sites[k].building_id] = shapely.transform(drawn[k] if apart is None else apart, lambda xy: xy / MM)
     return outlines
+
+
+def _with(outline_mm: MultiPolygon, pieces: Sequence[shapely.Polygon]) -> MultiPolygon:
+    return MultiPolygon(polygons_of(shapely.union_all([outline_mm, *pieces]))) if pieces else outline_mm
+
+
+def _taken(
+    pairs: Sequence[Sequence[int]],
+    sites: Sequence[CandidateSite],
+    drawn: Mapping[int, MultiPolygon],
+    task: TouchTask,
+    warnings: list[str],
+) -> dict[tuple[int, int], list[shapely.Polygon]]:
+    """What the first of two candidates takes of the slits beside the second, and the second beside the first.
+
+    It keeps a millimetre away from third outlines, and from what others take.
+    """
+    taken: dict[tuple[int, int], list[shapely.Polygon]] = {}
+    for (i, j), found in _slits(pairs, sites, drawn, task, warnings).items():
+        if found:
+            parts = _or_warned(warnings, (sites[i], sites[j]), functools.partial(closed, drawn[i], drawn[j], found))
+            taken[i, j], taken[j, i] = parts or ([], [])
+    apart = {}
+    for (k, j), pieces in taken.items():
+        others = [outline for m, outline in drawn.items() if m not in (k, j)]
+        others += [piece for (m, _), of_other in taken.items() if m != k for piece in of_other]
+        apart[k, j] = [part for piece in pieces for part in without(piece, others)]
+    return apart
 
 
 def _slits(
