@@ -13,6 +13,7 @@ import numpy as np
 import shapely
 from shapely import MultiPolygon, Polygon
 
+from pipeline.model import FloatArray
 from pipeline.roof.disjoint_outlines import effort
 from pipeline.roof.footprint import polygons_of
 
@@ -128,6 +129,22 @@ def without(area: Polygon, others: Sequence[shapely.Geometry]) -> list[Polygon]:
         return [area]
     wider = shapely.buffer(shapely.union_all(near, grid_size=1.0), _ROUNDING_MM, join_style="mitre")
     return polygons_of(shapely.difference(area, wider, grid_size=1.0))
+
+
+def united(outline_mm: MultiPolygon, pieces: Sequence[Polygon]) -> MultiPolygon:
+    """An outline with what it takes, without the hairlines that rounding leaves between them."""
+    if not pieces:
+        return outline_mm
+    whole = shapely.union_all([outline_mm, *pieces])
+    for distance in (_ROUNDING_MM, -_ROUNDING_MM):
+        whole = shapely.buffer(whole, distance, join_style="mitre", mitre_limit=_MITRE)
+    return MultiPolygon(polygons_of(shapely.transform(whole, _near_grid)))
+
+
+def _near_grid(xy: FloatArray) -> FloatArray:
+    """Places with those coordinates rounded that offsets moved by less than a micrometre."""
+    rounded = np.rint(xy)
+    return np.where(np.abs(xy - rounded) < 1e-3, rounded, xy)
 
 
 def _overlap(area: Polygon, others: MultiPolygon) -> bool:

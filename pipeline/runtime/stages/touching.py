@@ -22,10 +22,9 @@ from pipeline.io.gps_time import GpsTimeKind
 from pipeline.model import IntArray
 from pipeline.prepared_cloud import prepare_cloud
 from pipeline.roof.disjoint_outlines import Claim, divided, left_of
-from pipeline.roof.footprint import polygons_of
 from pipeline.roof.plan import drawn_outline, roof_points
 from pipeline.roof.roof_settings import RoofSettings
-from pipeline.roof.slits import GAP_MM, Slit, between, closed, slits, without
+from pipeline.roof.slits import GAP_MM, Slit, between, closed, slits, united, without
 from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import OpenScratch, Scratch
 from pipeline.runtime.scratch.outcomes import Files, InParts, Place, brief_within, drop_outcomes, key_of
@@ -187,7 +186,7 @@ def _outlines_of(
 
     def of_pair(i: int, j: int) -> tuple[MultiPolygon, MultiPolygon]:
         first, second = (
-            dataclasses.replace(claim(k), outline_mm=_with(drawn[k], taken.get((k, other), ())))
+            dataclasses.replace(claim(k), outline_mm=united(drawn[k], taken.get((k, other), ())))
             for k, other in ((i, j), (j, i))
         )
         return divided(first, second)
@@ -204,17 +203,13 @@ def _outlines_of(
         if k < owned:
             gained = {j: pieces for (of, j), pieces in taken.items() if of == k}
             limits = [
-                _with(shape, [piece for other, pieces in gained.items() if other != j for piece in pieces])
+                united(shape, [piece for other, pieces in gained.items() if other != j for piece in pieces])
                 for j, shape in kept[k].items()
             ]
             cut = functools.partial(left_of, drawn[k], limits, task.roof.min_part_area_m2)
             apart = _or_warned(warnings, (sites[k],), cut)
             outlines[sites[k].building_id] = shapely.transform(drawn[k] if apart is None else apart, lambda xy: xy / MM)
     return outlines
-
-
-def _with(outline_mm: MultiPolygon, pieces: Sequence[shapely.Polygon]) -> MultiPolygon:
-    return MultiPolygon(polygons_of(shapely.union_all([outline_mm, *pieces]))) if pieces else outline_mm
 
 
 def _taken(
