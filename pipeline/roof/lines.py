@@ -35,6 +35,8 @@ class Run:
     """From the first to the last vertex."""
     exact: bool = False
     """Whether the line, or its direction, is known otherwise than by the stretch."""
+    own: float = 0.0
+    """Direction of the stretch alone, where `fitted_runs` found it, radians."""
 
 
 def fitted_run(border: FloatArray, first: int, last: int) -> Run:
@@ -49,7 +51,7 @@ def fitted_run(border: FloatArray, first: int, last: int) -> Run:
 def fitted_runs(border: FloatArray, ends: IntArray) -> list[Run]:
     """The lines through the stretches between each two vertices that follow one another, (e + 1,)."""
     lines, pairs = _fits(border, ends).tolist(), itertools.pairwise(ends.tolist())
-    return [Run(first, last, *line) for (first, last), line in zip(pairs, lines, strict=True)]
+    return [Run(first, last, *line, own=line[2]) for (first, last), line in zip(pairs, lines, strict=True)]
 
 
 @kernel

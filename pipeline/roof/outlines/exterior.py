@@ -22,7 +22,7 @@ from pipeline.compiler import kernel
 from pipeline.model import FloatArray, IntArray
 from pipeline.roof.edge_position import EdgePoints, mixed_pulse_reach_mm, outward_shift_mm
 from pipeline.roof.footprint import polygons_of
-from pipeline.roof.lines import Run, corners, crossing, fitted_run, fitted_runs, projected
+from pipeline.roof.lines import Run, corners, crossing, fitted_runs, projected
 from pipeline.roof.outlines.description import FREE, Prices, least_description
 from pipeline.roof.roof_settings import RoofSettings
 from pipeline.roof.snapped_rings import differ_by_more, on_grid, snapped_ring
@@ -187,12 +187,13 @@ def described(rings: Sequence[_Ring], spacing_mm: float, noise_mm: float) -> lis
             if any(abs(off_square(angle, system)) < _APART for system in systems):
                 continue
             more = [*systems, angle]
-            for _ in range(2):
+            for is_last in (False, True):
                 found = [_runs(ring, pairs_of(more), per_mm, PRICES) for ring in rings]
                 cost = math.fsum(own_cost for _, own_cost in found) + _SYSTEM * len(more)
                 if better is None or cost < better[0]:
                     better = cost, more, [own for own, _ in found]
-                more = _more_exact(more, [(ring, own) for ring, (own, _) in zip(rings, found, strict=True)])
+                if not is_last:
+                    more = _more_exact(more, [run for own, _ in found for run in own if run.exact])
         if better is None or better[0] >= least:
             break
         least, systems, best = better
@@ -256,18 +257,14 @@ def peaks_of(runs: Sequence[Run], most: int = _TRIED) -> list[float]:
     return found
 
 
-def _more_exact(systems: Sequence[float], drawn: Sequence[tuple[_Ring, list[Run]]]) -> list[float]:
+def _more_exact(systems: Sequence[float], runs: Sequence[Run]) -> list[float]:
     """The directions as the borders along their edges have them, on average."""
     offs: list[list[tuple[float, float]]] = [[] for _ in systems]
-    for ring, runs in drawn:
-        for run in runs:
-            if not run.exact:
-                continue
-            own = fitted_run(ring.border, run.first, run.last).direction
-            k = min(range(len(systems)), key=lambda k: abs(off_square(run.direction, systems[k])))
-            off = off_square(own, systems[k])
-            if abs(off) < _ABOUT:
-                offs[k].append((off, run.length**3))
+    for run in runs:
+        k = min(range(len(systems)), key=lambda k: abs(off_square(run.direction, systems[k])))
+        off = off_square(run.own, systems[k])
+        if abs(off) < _ABOUT:
+            offs[k].append((off, run.length**3))
     return [
         system + (math.fsum(off * w for off, w in of) / math.fsum(w for _, w in of) if of else 0.0)
         for system, of in zip(systems, offs, strict=True)
