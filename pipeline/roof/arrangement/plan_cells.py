@@ -235,16 +235,12 @@ def _borders_of_faces(faces: LabelArray, count: int, pairs: IntArray, weights: I
 
 @kernel(inline="always")
 def _fitted(misfits: IntArray, label_of: LabelArray, held: IntArray, keys: IntArray) -> BoolArray:
-    """Whether the points of each face, (f,), fit its own plane and no neighbour's.
-
-    `misfits` (f, k) and points `held` (f,) are sums; `keys` are those of `_borders_of_faces`.
-    """
-    count = len(held)
-    is_fitted = np.empty(count, np.bool_)
-    for f in range(count):
+    """Whether the points `held` by each face, (f,), fit its plane and no neighbour's; keys of `_borders_of_faces`."""
+    is_fitted = np.empty(len(held), np.bool_)
+    for f in range(len(held)):
         is_fitted[f] = misfits[f, label_of[f]] < _SMEARED_SHARE * COST_SCALE * held[f]
     for key in keys:
-        f, g = key // count, key % count
+        f, g = key // len(held), key % len(held)
         is_fitted[f] &= misfits[f, label_of[g]] >= _LOW_SHARE * COST_SCALE * held[f]
     return is_fitted
 
