@@ -40,6 +40,7 @@ class Prices(NamedTuple):
 _SHARP = math.cos(math.radians(180.0 - 63.0))
 _FLAT = math.sin(math.radians(12.0))
 _SQUARE = math.sin(math.radians(81.0))
+_ACUTE = math.cos(math.radians(50.0))
 _LEAST_PROGRESS = 0.3
 """The chord of an edge is at least this share of the border along it, in the edge's direction."""
 
@@ -98,9 +99,21 @@ def _turns(directions: FloatArray, prices: Prices) -> FloatArray:
     return turns
 
 
+@kernel(inline="always")
+def _end_price(angle: float, met: float, prices: Prices) -> float:
+    """The price of an edge that ends on a line met at an angle, which has a side on both hands; nan: it meets none."""
+    cosine, sine = abs(math.cos(angle - met)), abs(math.sin(angle - met))
+    price = 0.0
+    if sine < _SQUARE:
+        price += prices.change
+    if cosine > _ACUTE:
+        price += prices.sharp
+    return price
+
+
 @kernel
 def least_description(
-    border: FloatArray, breaks: IntArray, directions: FloatArray, per_mm: float, prices: Prices
+    border: FloatArray, breaks: IntArray, directions: FloatArray, per_mm: float, prices: Prices, met: FloatArray
 ) -> tuple[IntArray, IntArray, FloatArray, float]:
     """The edges from the first break of a border to the last that are described shortest.
 
@@ -116,6 +129,8 @@ def least_description(
         Nats per millimetre of the border and square millimetre of its distance from the edge.
     prices : Prices
         What edges and turns cost.
+    met : (2,) float64
+        Directions of the lines on which the first edge begins and the last one ends, radians; nan where there is none.
 
     Returns
     -------
@@ -177,6 +192,10 @@ def least_description(
                 if total >= best[j, state] or abs(along) < _LEAST_PROGRESS * w:
                     continue
                 last = through[i, state]
+                if i == 0:
+                    total += _end_price(angle, met[0], prices)
+                if j == m - 1:
+                    total += _end_price(angle, met[1], prices)
                 if i > 0 and free in (state, last):
                     turn = angle - angles[i, last]
                     total += _turn_price(math.cos(turn), math.sin(turn), prices)

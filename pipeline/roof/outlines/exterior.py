@@ -63,6 +63,8 @@ _MOVED = 1.2
 """Most area between the raw outline and the edges: this many standard deviations of it times its length."""
 _SAME = math.cos(math.radians(3.0))
 _QUARTER = 0.5 * math.pi
+_NONE_MET = np.full(2, np.nan)
+"""A closed border, or one that ends on nothing."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -206,9 +208,11 @@ def described(rings: Sequence[_Ring], spacing_mm: float, noise_mm: float) -> lis
     return [(ring.border, own) for ring, own in zip(rings, best, strict=True)]
 
 
-def _runs(ring: _Ring, directions: FloatArray, per_mm: float, prices: Prices) -> tuple[list[Run], float]:
+def _runs(
+    ring: _Ring, directions: FloatArray, per_mm: float, prices: Prices, met: FloatArray = _NONE_MET
+) -> tuple[list[Run], float]:
     """The edges of a ring, and the length of their description."""
-    ends, of_edge, angles, cost = least_description(ring.border, ring.breaks, directions, per_mm, prices)
+    ends, of_edge, angles, cost = least_description(ring.border, ring.breaks, directions, per_mm, prices, met)
     runs = []
     for k, (index, angle) in enumerate(zip(of_edge.tolist(), angles.tolist(), strict=True)):
         run = fitted_run(ring.border, int(ring.breaks[ends[k]]), int(ring.breaks[ends[k + 1]]))
@@ -218,14 +222,19 @@ def _runs(ring: _Ring, directions: FloatArray, per_mm: float, prices: Prices) ->
 
 
 def described_chain(
-    border: FloatArray, directions: FloatArray, spacing_mm: float, noise_mm: float, prices: Prices
+    border: FloatArray,
+    directions: FloatArray,
+    spacing_mm: float,
+    noise_mm: float,
+    prices: Prices,
+    met: FloatArray = _NONE_MET,
 ) -> list[Run]:
-    """The edges of an open border (n, 2), of which `directions` are common to others."""
+    """The edges of an open border (n, 2), of which `directions` are common to others; `met` as it is described."""
     step = _BREAK_SPACINGS * spacing_mm
     breaks = breaks_of(border, step)[:-1]
     breaks = np.append(breaks[:-1] if len(breaks) > 1 else breaks, len(border) - 1)
     per_mm = 0.5 / (spacing_mm * noise_mm * noise_mm)
-    return _runs(_Ring(border=border, breaks=breaks), directions, per_mm, prices)[0]
+    return _runs(_Ring(border=border, breaks=breaks), directions, per_mm, prices, met)[0]
 
 
 def pairs_of(systems: Sequence[float]) -> FloatArray:

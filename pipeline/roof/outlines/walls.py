@@ -62,6 +62,8 @@ class _Wall:
     """(n, 2), millimetres."""
     runs: list[Run]
     """Its edges."""
+    directions: FloatArray
+    """Those of the outline nearby, radians."""
 
 
 def divided(
@@ -78,11 +80,24 @@ def divided(
     walls = []
     for border in _through(_borders(units, shapely.buffer(outline_mm, beyond))):
         near = edges[shapely.distance(LineString(border), shapely.linestrings(edges.reshape(-1, 2, 2))) <= _NEARBY_MM]
-        runs = described_chain(border, pairs_of(peaks_of(_edge_runs(near))), spacing_mm, _noise_mm(spacing_m), PRICES)
-        walls.append(_Wall(border, runs))
+        directions = pairs_of(peaks_of(_edge_runs(near)))
+        runs = described_chain(border, directions, spacing_mm, _noise_mm(spacing_m), PRICES)
+        walls.append(_Wall(border, runs, directions))
     _put_in_line(walls, edges, max(_IN_LINE_MM, spacing_mm))
     lines = [_drawn(wall, beyond) for wall in walls]
     far = max(_FAR_SPACINGS * spacing_mm, 1e3 * _FAR_M)
+    met = [_met(k, lines, edges, beyond, far) for k in range(len(lines))]
+    walls = [
+        dataclasses.replace(
+            wall,
+            runs=described_chain(
+                wall.border, wall.directions, spacing_mm, _noise_mm(spacing_m), PRICES, np.array([m[1] for m in ends])
+            ),
+        )
+        for wall, ends in zip(walls, met, strict=True)
+    ]
+    _put_in_line(walls, edges, max(_IN_LINE_MM, spacing_mm))
+    lines = [_drawn(wall, beyond) for wall in walls]
     chords = [_ended(k, lines, edges, beyond, far) for k in range(len(lines))]
     cells, owners = _cells(outline_mm, chords, xy_mm, unit)
     lost = set(units.labels.tolist()) - set(owners)
@@ -227,15 +242,22 @@ def _drawn(wall: _Wall, beyond: float) -> FloatArray:
     return np.array([ends[0], *between, ends[1]])
 
 
-def _ended(number: int, lines: Sequence[FloatArray], edges: FloatArray, beyond: float, far: float) -> FloatArray:
-    """A wall whose ends lie on what they meet nearest to them, the outline or another wall."""
+def _met(
+    number: int, lines: Sequence[FloatArray], edges: FloatArray, beyond: float, far: float
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """What a wall meets nearest to each of its ends, the outline or another wall.
+
+    How far that is from the vertex before, millimetres, and the direction of what is met, radians; nan for nothing.
+    """
     others = [np.column_stack((line[:-1], line[1:])) for k, line in enumerate(lines) if k != number]
     obstacles = np.concatenate((edges, *others))
-    line = lines[number].copy()
+    line = lines[number]
+    met = []
     for end, before in ((0, 1), (-1, -2)):
         way = line[end] - line[before]
         length = float(np.hypot(*way))
         if length == 0.0:
+            met.append((math.nan, math.nan))
             continue
         way /= length
         border_end = length - beyond
@@ -247,10 +269,21 @@ def _ended(number: int, lines: Sequence[FloatArray], edges: FloatArray, beyond: 
             t, u = (dx * uy - dy * ux) / det, (dx * way[1] - dy * way[0]) / det
         meets = (np.abs(det) > 1e-9) & (u >= 0.0) & (u <= 1.0) & (t > 0.1 * length) & (t <= border_end + far)
         meets &= t >= border_end - 2.0 * beyond
-        if meets.any():
-            at = t[meets]
-            place = float(at[np.argmin(np.abs(at - border_end))])
-            line[end] = line[before] + (place + _OVERSHOOT_MM) * way
+        if not meets.any():
+            met.append((math.nan, math.nan))
+            continue
+        nearest = int(np.argmin(np.where(meets, np.abs(t - border_end), np.inf)))
+        met.append((float(t[nearest]), math.atan2(uy[nearest], ux[nearest])))
+    return met[0], met[1]
+
+
+def _ended(number: int, lines: Sequence[FloatArray], edges: FloatArray, beyond: float, far: float) -> FloatArray:
+    """A wall whose ends lie on what they meet."""
+    line = lines[number].copy()
+    for (place, _), end, before in zip(_met(number, lines, edges, beyond, far), (0, -1), (1, -2), strict=True):
+        if not math.isnan(place):
+            way = line[end] - line[before]
+            line[end] = line[before] + (place + _OVERSHOOT_MM) / float(np.hypot(*way)) * way
     return line
 
 
