@@ -37,10 +37,9 @@ class Prices(NamedTuple):
     """For a turn of less than 12 degrees: the noise of the lines moves such a corner far."""
 
 
-_SHARP = math.cos(math.radians(180.0 - 63.0))
+SHARP = math.cos(math.radians(180.0 - 63.0))
 _FLAT = math.sin(math.radians(12.0))
 _SQUARE = math.sin(math.radians(81.0))
-_ACUTE = math.cos(math.radians(50.0))
 _LEAST_PROGRESS = 0.3
 """The chord of an edge is at least this share of the border along it, in the edge's direction."""
 
@@ -74,7 +73,7 @@ def _turn_price(cosine: float, sine: float, prices: Prices) -> float:
     price = 0.0
     if abs(sine) < _SQUARE:
         price += prices.change
-    if cosine < _SHARP:
+    if cosine < SHARP:
         price += prices.sharp
     elif abs(sine) < _FLAT:
         price += prices.flat
@@ -106,7 +105,7 @@ def _end_price(angle: float, met: float, prices: Prices) -> float:
     price = 0.0
     if sine < _SQUARE:
         price += prices.change
-    if cosine > _ACUTE:
+    if cosine > -SHARP:
         price += prices.sharp
     return price
 

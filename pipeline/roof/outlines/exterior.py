@@ -142,7 +142,7 @@ def _straight_rings(
 
 def _of_few_points(border: FloatArray, spacing_m: float, points: EdgePoints, noise_mm: float) -> FloatArray | None:
     """The likeliest ring around few points: as described, or in two directions of any."""
-    from pipeline.roof.outlines.few_points import directions, envelope_mm, likeliest
+    from pipeline.roof.outlines.few_points import directions, envelope_mm, likeliest, sharp_corners
 
     xy_mm = points.xy_mm.astype(np.float64)
     near = shapely.contains_xy(shapely.buffer(Polygon(border), 1e3 * spacing_m), xy_mm)
@@ -166,7 +166,7 @@ def _of_few_points(border: FloatArray, spacing_m: float, points: EdgePoints, noi
         found = _ring_of(along, runs, least, 4.0 * noise_mm) if len(runs) >= _FEWEST else None
         if found is not None:
             free = sum(not run.exact for run in runs)
-            cost = PRICES.edge * len(found) + PRICES.free * free
+            cost = PRICES.edge * len(found) + PRICES.free * free + PRICES.sharp * sharp_corners(found)
             drawings.append((cost, found))
     return likeliest(drawings, xy_mm, spacing_m)
 

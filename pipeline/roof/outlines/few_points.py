@@ -16,6 +16,7 @@ from shapely import Polygon
 
 from pipeline.model import FloatArray
 from pipeline.roof.lines import Run
+from pipeline.roof.outlines.description import SHARP
 
 _OFF_MM = 120.0
 """Standard deviation of a point about the edge that it lies outside of."""
@@ -46,6 +47,14 @@ def envelope_mm(run: Run, xy_mm: FloatArray, area_mm2: float, out_mm: float) -> 
     outside = np.minimum(0.5 * (beyond / _OFF_MM) ** 2, _MOST).sum(axis=0)
     # the edge lies beyond its outermost point by the mean way to the next one
     return float(beside[np.argmin(a_mm * beside + outside)]) + min(1.0 / a_mm, 0.5 * out_mm)
+
+
+def sharp_corners(ring: FloatArray) -> int:
+    """The number of inner angles below 63 degrees of a ring (n, 2)."""
+    edges = ring - np.roll(ring, 1, axis=0)
+    cosine = (edges * np.roll(edges, -1, axis=0)).sum(axis=1)
+    lengths = np.hypot(edges[:, 0], edges[:, 1])
+    return int(np.count_nonzero(cosine < SHARP * lengths * np.roll(lengths, -1)))
 
 
 def likeliest(drawings: Iterable[tuple[float, FloatArray]], xy_mm: FloatArray, spacing_m: float) -> FloatArray | None:

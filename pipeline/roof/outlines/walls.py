@@ -30,6 +30,7 @@ PRICES = Prices(edge=6.0, free=14.0, change=4.0, sharp=60.0, flat=60.0)
 _NOISE_SPACINGS, _NOISE_M = 0.8, 0.4
 """Standard deviation of the border between two units about their wall: in point spacings, and at least."""
 _BEYOND_SPACINGS, _BEYOND_M = 2.0, 1.0
+CLIP=.25
 """How far beyond the outline borders are followed, and walls reach beyond their borders."""
 _FAR_SPACINGS, _FAR_M = 8.0, 6.0
 """How far a wall is continued until it meets something."""
@@ -49,6 +50,10 @@ _WAY_MM = 2500.0
 """The direction of a border at its end is that of this much of it."""
 _OVERSHOOT_MM = 5.0
 """Walls end this far beyond what they meet: the lines must cross."""
+_AWAY = np.array([[-1.0, 0.0], [0.0, -1.0], [1.0, 0.0], [0.0, 1.0]])
+"""The way from the first end of an edge (4,) to its second one."""
+_ACUTE = math.cos(math.radians(50.0))
+"""Cosine of the least angle between a wall and the edges of a corner that it is moved to."""
 _LEAST_CELL_MM2 = 2e6
 _LEAST_WIDTH_MM = 500.0
 """Smaller or narrower cells join the neighbour with the longest common wall."""
@@ -78,7 +83,7 @@ def divided(
     edges = _edges_of(outline_mm)
     beyond = max(_BEYOND_SPACINGS * spacing_mm, 1e3 * _BEYOND_M)
     walls = []
-    for border in _through(_borders(units, shapely.buffer(outline_mm, beyond))):
+    for border in _through(_borders(units, shapely.buffer(outline_mm, CLIP * beyond))):
         near = edges[shapely.distance(LineString(border), shapely.linestrings(edges.reshape(-1, 2, 2))) <= _NEARBY_MM]
         directions = pairs_of(peaks_of(_edge_runs(near)))
         runs = described_chain(border, directions, spacing_mm, _noise_mm(spacing_m), PRICES)
@@ -91,12 +96,16 @@ def divided(
         dataclasses.replace(
             wall,
             runs=described_chain(
-                wall.border, wall.directions, spacing_mm, _noise_mm(spacing_m), PRICES, np.array([m[1] for m in ends])
+                wall.border, wall.directions, spacing_mm, _noise_mm(spacing_m), PRICES, _directions_of(ends)
             ),
         )
         for wall, ends in zip(walls, met, strict=True)
     ]
     _put_in_line(walls, edges, max(_IN_LINE_MM, spacing_mm))
+    lines = [_drawn(wall, beyond) for wall in walls]
+    per_mm = 0.5 / (spacing_mm * _noise_mm(spacing_m) ** 2)
+    for k, wall in enumerate(walls):
+        _put_through_corner(wall, _met(k, lines, edges, beyond, far), edges, per_mm)
     lines = [_drawn(wall, beyond) for wall in walls]
     chords = [_ended(k, lines, edges, beyond, far) for k in range(len(lines))]
     cells, owners = _cells(outline_mm, chords, xy_mm, unit)
@@ -244,20 +253,20 @@ def _drawn(wall: _Wall, beyond: float) -> FloatArray:
 
 def _met(
     number: int, lines: Sequence[FloatArray], edges: FloatArray, beyond: float, far: float
-) -> tuple[tuple[float, float], tuple[float, float]]:
-    """What a wall meets nearest to each of its ends, the outline or another wall.
+) -> tuple[tuple[float, FloatArray] | None, ...]:
+    """What a wall meets nearest to its first end and to its last one, the outline or another wall; None for nothing.
 
-    How far that is from the vertex before, millimetres, and the direction of what is met, radians; nan for nothing.
+    How far that is from the vertex before, millimetres, and the ends (4,) of what is met.
     """
     others = [np.column_stack((line[:-1], line[1:])) for k, line in enumerate(lines) if k != number]
     obstacles = np.concatenate((edges, *others))
     line = lines[number]
-    met = []
+    met: list[tuple[float, FloatArray] | None] = []
     for end, before in ((0, 1), (-1, -2)):
         way = line[end] - line[before]
         length = float(np.hypot(*way))
         if length == 0.0:
-            met.append((math.nan, math.nan))
+            met.append(None)
             continue
         way /= length
         border_end = length - beyond
@@ -269,21 +278,46 @@ def _met(
             t, u = (dx * uy - dy * ux) / det, (dx * way[1] - dy * way[0]) / det
         meets = (np.abs(det) > 1e-9) & (u >= 0.0) & (u <= 1.0) & (t > 0.1 * length) & (t <= border_end + far)
         meets &= t >= border_end - 2.0 * beyond
-        if not meets.any():
-            met.append((math.nan, math.nan))
-            continue
         nearest = int(np.argmin(np.where(meets, np.abs(t - border_end), np.inf)))
-        met.append((float(t[nearest]), math.atan2(uy[nearest], ux[nearest])))
-    return met[0], met[1]
+        met.append((float(t[nearest]), obstacles[nearest]) if meets[nearest] else None)
+    return tuple(met)
+
+
+def _directions_of(met: Sequence[tuple[float, FloatArray] | None]) -> FloatArray:
+    """The directions (2,) of what a wall meets, radians; nan for nothing."""
+    return np.array([math.nan if one is None else math.atan2(one[1][3] - one[1][1], one[1][2] - one[1][0]) for one in met])
+
+
+def _put_through_corner(
+    wall: _Wall, met: Sequence[tuple[float, FloatArray] | None], edges: FloatArray, per_mm: float
+) -> None:
+    """Move an end of a wall to the corner beside the place where it meets the outline, if that costs less than an edge."""
+    moves = []
+    for run, one, sense in ((wall.runs[0], met[0], 1.0), (wall.runs[-1], met[1], -1.0)):
+        if one is None or not (edges == one[1]).all(axis=1).any():
+            continue
+        inwards = sense * np.array([math.cos(run.direction), math.sin(run.direction)])
+        for corner in one[1].reshape(2, 2):
+            off = inwards[0] * (corner[1] - run.y) - inwards[1] * (corner[0] - run.x)
+            ways = np.concatenate(
+                [edges[(edges[:, k : k + 2] == corner).all(axis=1)] @ turn for k, turn in ((0, _AWAY), (2, -_AWAY))]
+            )
+            if per_mm * run.length * off * off >= PRICES.edge:
+                continue
+            if (ways @ inwards <= _ACUTE * np.hypot(*ways.T)).all():
+                moves.append((abs(off), sense * off, run))
+    for _, off, run in sorted(moves, key=lambda move: move[0])[:1] if wall.runs[0] is wall.runs[-1] else moves:
+        run.x -= off * math.sin(run.direction)
+        run.y += off * math.cos(run.direction)
 
 
 def _ended(number: int, lines: Sequence[FloatArray], edges: FloatArray, beyond: float, far: float) -> FloatArray:
     """A wall whose ends lie on what they meet."""
     line = lines[number].copy()
-    for (place, _), end, before in zip(_met(number, lines, edges, beyond, far), (0, -1), (1, -2), strict=True):
-        if not math.isnan(place):
+    for one, end, before in zip(_met(number, lines, edges, beyond, far), (0, -1), (1, -2), strict=True):
+        if one is not None:
             way = line[end] - line[before]
-            line[end] = line[before] + (place + _OVERSHOOT_MM) / float(np.hypot(*way)) * way
+            line[end] = line[before] + (one[0] + _OVERSHOOT_MM) / float(np.hypot(*way)) * way
     return line
 
 
