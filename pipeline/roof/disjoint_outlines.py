@@ -9,6 +9,7 @@ millimetres of the CRS. A border between two outlines has the same corners on bo
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from collections.abc import Set as AbstractSet
 
@@ -85,20 +86,27 @@ def divided(first: Claim, second: Claim) -> tuple[list[Polygon], list[Polygon]]:
 
 
 def _shares(piece: Polygon, first: Claim, second: Claim) -> tuple[list[Polygon], list[Polygon]]:
-    """The shares of both in one piece of their overlap, by the least cost; of equal ones the first is taken."""
+    """What both take from the other in one piece of their overlap, by the least cost; of equal ones the first one."""
     own, other = _inside(piece, first.points_mm), _inside(piece, second.points_mm)
-    options = [([piece], list[Polygon](), len(other)), (list[Polygon](), [piece], len(own))]
+    none: list[Polygon] = []
+    options = [([piece], none, len(other)), (none, [piece], len(own))]
     if min(len(own), len(other)) >= _FEWEST_WRONG:
         options.extend(_chords(piece, own, other))
-    costs = []
+    options.extend((taken, none, wrong) for taken, wrong in _retreats(piece, second))
+    options.extend((none, taken, wrong) for taken, wrong in _retreats(piece, first))
+    whole = [_effort(claim.outline_mm) for claim in (first, second)]
+    least, best = math.inf, (none, none)
     for mine, theirs, wrong in options:
         cost = _WRONG_COST * wrong
-        for claim, lost in ((first, theirs), (second, mine)):
-            left = shapely.difference(claim.outline_mm, MultiPolygon(lost), grid_size=1.0) if lost else claim.outline_mm
-            cost += _effort(left) + (_BARRED if left.area < _KEPT_SHARE * claim.outline_mm.area else 0.0)
-        costs.append(cost)
-    mine, theirs, _ = options[int(np.argmin(costs))]
-    return mine, theirs
+        for claim, lost, effort in ((first, theirs, whole[0]), (second, mine, whole[1])):
+            if not lost:
+                cost += effort
+            elif cost < least:
+                left = shapely.difference(claim.outline_mm, MultiPolygon(lost), grid_size=1.0)
+                cost += _effort(left) + (_BARRED if left.area < _KEPT_SHARE * claim.outline_mm.area else 0.0)
+        if cost < least:
+            least, best = cost, (mine, theirs)
+    return best
 
 
 def _inside(piece: Polygon, points_mm: IntArray) -> IntArray:
@@ -109,6 +117,24 @@ def _inside(piece: Polygon, points_mm: IntArray) -> IntArray:
     near = near[(near[:, 1] >= south) & (near[:, 1] <= north)]
     inside: IntArray = near[shapely.contains_xy(piece, near[:, 0], near[:, 1])]
     return inside
+
+
+def _retreats(piece: Polygon, claim: Claim) -> Iterator[tuple[list[Polygon], int]]:
+    """What a candidate gives up if it ends before a piece, along or square to its longest edge; its points in that."""
+    ring = shapely.get_coordinates(max(claim.outline_mm.geoms, key=lambda part: (part.area, part.bounds)).exterior)
+    edges = np.diff(ring, axis=0)
+    longest = edges[int(np.argmax(np.hypot(edges[:, 0], edges[:, 1])))]
+    reach = 2.0 * float(np.ptp(ring, axis=0).sum()) / np.hypot(*longest)
+    places = shapely.get_coordinates(piece)
+    for _ in range(4):
+        along = np.rint(reach * longest)
+        across = np.array([-along[1], along[0]])
+        nearest = places[int(np.argmin((places - places[0]) @ across))]
+        ends = np.array([nearest - along, nearest + along])
+        beyond = shapely.intersection(claim.outline_mm, Polygon([*ends, *(ends[::-1] + across)]), grid_size=1.0)
+        taken = polygons_of(shapely.union_all([beyond, piece], grid_size=1.0))
+        yield taken, sum(len(_inside(one, claim.points_mm)) for one in taken)
+        longest = across / reach
 
 
 def _chords(piece: Polygon, own: IntArray, other: IntArray) -> Iterator[tuple[list[Polygon], list[Polygon], int]]:
