@@ -29,8 +29,7 @@ PRICES = Prices(edge=6.0, free=14.0, change=4.0, sharp=60.0, flat=60.0)
 """A wall inside a block is seen less well than an outline: it costs more to bend it."""
 _NOISE_SPACINGS, _NOISE_M = 0.8, 0.4
 """Standard deviation of the border between two units about their wall: in point spacings, and at least."""
-_BEYOND_SPACINGS, _BEYOND_M = 2.0, 1.0
-CLIP=.25
+_BEYOND_SPACINGS, _BEYOND_M = 1.0, 0.5
 """How far beyond the outline borders are followed, and walls reach beyond their borders."""
 _FAR_SPACINGS, _FAR_M = 8.0, 6.0
 """How far a wall is continued until it meets something."""
@@ -56,6 +55,7 @@ _ACUTE = math.cos(math.radians(50.0))
 """Cosine of the least angle between a wall and the edges of a corner that it is moved to."""
 _LEAST_CELL_MM2 = 2e6
 _LEAST_WIDTH_MM = 500.0
+_LEAST_OWN = 0.5
 """Smaller or narrower cells join the neighbour with the longest common wall."""
 
 
@@ -83,7 +83,7 @@ def divided(
     edges = _edges_of(outline_mm)
     beyond = max(_BEYOND_SPACINGS * spacing_mm, 1e3 * _BEYOND_M)
     walls = []
-    for border in _through(_borders(units, shapely.buffer(outline_mm, CLIP * beyond))):
+    for border in _through(_borders(units, shapely.buffer(outline_mm, beyond))):
         near = edges[shapely.distance(LineString(border), shapely.linestrings(edges.reshape(-1, 2, 2))) <= _NEARBY_MM]
         directions = pairs_of(peaks_of(_edge_runs(near)))
         runs = described_chain(border, directions, spacing_mm, _noise_mm(spacing_m), PRICES)
@@ -91,12 +91,12 @@ def divided(
     _put_in_line(walls, edges, max(_IN_LINE_MM, spacing_mm))
     lines = [_drawn(wall, beyond) for wall in walls]
     far = max(_FAR_SPACINGS * spacing_mm, 1e3 * _FAR_M)
-    met = [_met(k, lines, edges, beyond, far) for k in range(len(lines))]
+    met = [_beside(k, walls, lines, edges) for k in range(len(lines))]
     walls = [
         dataclasses.replace(
             wall,
             runs=described_chain(
-                wall.border, wall.directions, spacing_mm, _noise_mm(spacing_m), PRICES, _directions_of(ends)
+                wall.border, wall.directions, spacing_mm, _noise_mm(spacing_m), PRICES, ends
             ),
         )
         for wall, ends in zip(walls, met, strict=True)
@@ -108,8 +108,8 @@ def divided(
         _put_through_corner(wall, _met(k, lines, edges, beyond, far), edges, per_mm)
     lines = [_drawn(wall, beyond) for wall in walls]
     chords = [_ended(k, lines, edges, beyond, far) for k in range(len(lines))]
-    cells, owners = _cells(outline_mm, chords, xy_mm, unit)
-    lost = set(units.labels.tolist()) - set(owners)
+    cells, owners, lost = _cells(outline_mm, chords, xy_mm, unit)
+    lost = [label for label in np.unique(units.labels).tolist() if label in lost or label not in owners]
     if lost:
         # a unit that no wall separates is drawn around its own points
         directions = pairs_of(peaks_of(_edge_runs(edges), 3))
@@ -118,7 +118,7 @@ def divided(
             for polygon, label in zip(units.polygons, units.labels.tolist(), strict=True)
             if label in lost
         ]
-        cells, owners = _cells(outline_mm, [*chords, *around], xy_mm, unit)
+        cells, owners, _ = _cells(outline_mm, [*chords, *around], xy_mm, unit)
     return _united(cells, owners)
 
 
@@ -270,22 +270,30 @@ def _met(
             continue
         way /= length
         border_end = length - beyond
+        least = 0.1 * length if len(line) == 2 else -_OVERSHOOT_MM
         # the places on the ray from the vertex before at which it meets an obstacle
         ux, uy = obstacles[:, 2] - obstacles[:, 0], obstacles[:, 3] - obstacles[:, 1]
         det = way[0] * uy - way[1] * ux
         dx, dy = obstacles[:, 0] - line[before, 0], obstacles[:, 1] - line[before, 1]
         with np.errstate(divide="ignore", invalid="ignore"):
             t, u = (dx * uy - dy * ux) / det, (dx * way[1] - dy * way[0]) / det
-        meets = (np.abs(det) > 1e-9) & (u >= 0.0) & (u <= 1.0) & (t > 0.1 * length) & (t <= border_end + far)
+        meets = (np.abs(det) > 1e-9) & (u >= 0.0) & (u <= 1.0) & (t > least) & (t <= border_end + far)
         meets &= t >= border_end - 2.0 * beyond
         nearest = int(np.argmin(np.where(meets, np.abs(t - border_end), np.inf)))
         met.append((float(t[nearest]), obstacles[nearest]) if meets[nearest] else None)
     return tuple(met)
 
 
-def _directions_of(met: Sequence[tuple[float, FloatArray] | None]) -> FloatArray:
-    """The directions (2,) of what a wall meets, radians; nan for nothing."""
-    return np.array([math.nan if one is None else math.atan2(one[1][3] - one[1][1], one[1][2] - one[1][0]) for one in met])
+def _beside(number: int, walls: Sequence[_Wall], lines: Sequence[FloatArray], edges: FloatArray) -> FloatArray:
+    """The directions (2,) of the edges or other walls that are nearest to the ends of a border, radians."""
+    others = [np.column_stack((line[:-1], line[1:])) for k, line in enumerate(lines) if k != number]
+    obstacles = np.concatenate((edges, *others))
+    pieces = shapely.linestrings(obstacles.reshape(-1, 2, 2))
+    found = []
+    for place in walls[number].border[[0, -1]]:
+        nearest = obstacles[int(np.argmin(shapely.distance(shapely.Point(place), pieces)))]
+        found.append(math.atan2(nearest[3] - nearest[1], nearest[2] - nearest[0]))
+    return np.array(found)
 
 
 def _put_through_corner(
@@ -323,8 +331,8 @@ def _ended(number: int, lines: Sequence[FloatArray], edges: FloatArray, beyond: 
 
 def _cells(
     outline_mm: MultiPolygon, chords: Iterable[FloatArray], xy_mm: IntArray, unit: LabelArray
-) -> tuple[list[Polygon], list[int]]:
-    """The cells between an outline and some walls, and the unit of each."""
+) -> tuple[list[Polygon], list[int], set[int]]:
+    """The cells between an outline and some walls, the unit of each, and the units with few of their points in theirs."""
     drawn = [shapely.boundary(outline_mm), *(LineString(chord) for chord in chords)]
     net = shapely.union_all(drawn, grid_size=1.0)
     shapely.prepare(outline_mm)
@@ -334,7 +342,8 @@ def _cells(
         if shapely.contains(outline_mm, shapely.point_on_surface(cell))
     ]
     count = int(unit.max(initial=0)) + 1
-    owners = [_owner(cell, xy_mm, unit, count) for cell in cells]
+    counts = np.array([_counts(cell, xy_mm, unit, count) for cell in cells]).reshape(-1, count)
+    owners = np.where(counts.any(axis=1), counts.argmax(axis=1), -1).tolist()
     order = sorted(range(len(cells)), key=lambda k: (cells[k].area, cells[k].bounds))
     tree = shapely.STRtree(cells)
     for k in order:
@@ -343,7 +352,8 @@ def _cells(
     # cells amid others without points: each round joins those that touch a cell of a unit
     while sum(owners[k] < 0 and _join_neighbour(k, cells, owners, tree) for k in order):
         pass
-    return cells, owners
+    own = np.bincount(np.maximum(owners, 0), weights=counts[np.arange(len(owners)), owners], minlength=count)
+    return cells, owners, set(np.flatnonzero(own < _LEAST_OWN * counts.sum(axis=0)).tolist())
 
 
 def _join_neighbour(k: int, cells: Sequence[Polygon], owners: list[int], tree: shapely.STRtree) -> bool:
@@ -362,14 +372,14 @@ def _is_narrow(cell: Polygon) -> bool:
     return bool(shapely.is_empty(shapely.buffer(cell, -0.5 * _LEAST_WIDTH_MM)))
 
 
-def _owner(cell: Polygon, xy_mm: IntArray, unit: LabelArray, count: int) -> int:
-    """The unit that has most points in a cell; -1 where none has any."""
+def _counts(cell: Polygon, xy_mm: IntArray, unit: LabelArray, count: int) -> IntArray:
+    """The number of points of every unit in a cell."""
     left, bottom, right, top = cell.bounds
     low, high = np.searchsorted(xy_mm[:, 0], [left, right + 1.0])
     xy, of = xy_mm[low:high], unit[low:high]
     inside = (xy[:, 1] >= bottom) & (xy[:, 1] <= top) & (of >= 0)
     inside[inside] = shapely.contains_xy(cell, xy[inside].astype(np.float64))
-    return int(np.bincount(of[inside], minlength=count).argmax()) if inside.any() else -1
+    return np.bincount(of[inside], minlength=count)
 
 
 def _united(cells: Sequence[Polygon], owners: Sequence[int]) -> dict[int, MultiPolygon]:
