@@ -23,7 +23,7 @@ from pipeline.model import FloatArray, IntArray
 from pipeline.roof.edge_position import EdgePoints, mixed_pulse_reach_mm, outward_shift_mm
 from pipeline.roof.footprint import polygons_of
 from pipeline.roof.lines import Run, corners, crossing, fitted_run, projected
-from pipeline.roof.outlines.description import FREE, Prices, least_description
+from pipeline.roof.outlines.description import FREE, SHARP, Prices, least_description
 from pipeline.roof.roof_settings import RoofSettings
 from pipeline.roof.snapped_rings import differ_by_more, on_grid, snapped_ring
 
@@ -201,6 +201,10 @@ def described(rings: Sequence[_Ring], spacing_mm: float, noise_mm: float) -> lis
             break
         least, systems, best = better
     for k, ring in enumerate(rings):
+        if len(best[k]) > 2 and math.cos(best[k][0].direction - best[k][-1].direction) < SHARP:
+            # a spike where the ring begins is the only one without a price
+            rings[k] = ring = _begun_at_a_corner(ring, best[k])
+            best[k] = _runs(ring, pairs_of(systems), per_mm, PRICES)[0]
         if len(best[k]) < _FEWEST and len(ring.breaks) <= _FEW_BREAKS:
             # a few points never show a triangle: it is the cheapest way to cut the corners of a rectangle
             longest = max(best[k], key=lambda run: run.length).direction if best[k] else 0.0
@@ -333,11 +337,16 @@ def _take_positions(border: FloatArray, runs: Sequence[Run], points: EdgePoints,
 def without_short(border: FloatArray, runs: Sequence[Run], least_mm: float) -> list[Run]:
     """The edges of a closed border without those that are shorter between their corners, the shortest first.
 
-    Where the neighbours of such an edge are parallel, they are one edge.
+    Where the neighbours of such an edge are parallel, they are one edge; where they would meet in a spike, it stays.
     """
     left = list(runs)
     while len(left) > 4:
-        lengths = [_length_between(border, left, k) for k in range(len(left))]
+        lengths = [
+            math.inf
+            if math.cos(left[(k + 1) % len(left)].direction - left[k - 1].direction) < SHARP
+            else _length_between(border, left, k)
+            for k in range(len(left))
+        ]
         k = min(range(len(left)), key=lengths.__getitem__)
         if lengths[k] >= least_mm:
             break
