@@ -20,7 +20,7 @@ from shapely import LineString, MultiPolygon, Polygon
 
 from pipeline.model import FloatArray, IntArray, LabelArray
 from pipeline.roof.footprint import polygons_of
-from pipeline.roof.lines import Run, corners, fitted_run
+from pipeline.roof.lines import Run, corners, crossing, fitted_run
 from pipeline.roof.outlines.description import Prices
 from pipeline.roof.outlines.exterior import described_chain, pairs_of, peaks_of
 from pipeline.roof.partition import RoofPartition
@@ -101,6 +101,8 @@ def divided(
         )
         for wall, ends in zip(walls, met, strict=True)
     ]
+    for wall in walls:
+        _end_outside(wall.runs, outline_mm)
     _put_in_line(walls, edges, max(_IN_LINE_MM, spacing_mm))
     lines = [_drawn(wall, beyond) for wall in walls]
     per_mm = 0.5 / (spacing_mm * _noise_mm(spacing_m) ** 2)
@@ -237,6 +239,16 @@ def _put_in_line(walls: Sequence[_Wall], edges: FloatArray, most_mm: float) -> N
             run.x -= nearest * uy
             run.y += nearest * ux
         known = np.concatenate((known, [[run.x, run.y, ux, uy, run.length]]))
+
+
+def _end_outside(runs: list[Run], outline_mm: MultiPolygon) -> None:
+    """Leave out the edges behind the corners at which a wall has left the outline."""
+    for first, second in ((0, 1), (-1, -2)):
+        while len(runs) > 1:
+            corner = crossing(runs[first], runs[second])
+            if corner is None or shapely.contains_xy(outline_mm, *corner):
+                break
+            del runs[first]
 
 
 def _drawn(wall: _Wall, beyond: float) -> FloatArray:
