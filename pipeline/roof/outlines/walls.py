@@ -105,6 +105,9 @@ def divided(
         _end_outside(wall.runs, outline_mm)
     _put_in_line(walls, edges, max(_IN_LINE_MM, spacing_mm))
     lines = [_drawn(wall, beyond) for wall in walls]
+    for k, wall in enumerate(walls):
+        _without_stubs(wall.runs, lines[k], _met(k, lines, edges, beyond, far), beyond)
+    lines = [_drawn(wall, beyond) for wall in walls]
     per_mm = 0.5 / (spacing_mm * _noise_mm(spacing_m) ** 2)
     for k, wall in enumerate(walls):
         _put_through_corner(wall, _met(k, lines, edges, beyond, far), edges, per_mm)
@@ -249,6 +252,16 @@ def _end_outside(runs: list[Run], outline_mm: MultiPolygon) -> None:
             if corner is None or shapely.contains_xy(outline_mm, *corner):
                 break
             del runs[first]
+
+
+def _without_stubs(
+    runs: list[Run], line: FloatArray, met: Sequence[tuple[float, FloatArray] | None], beyond: float
+) -> None:
+    """Leave out edges at the ends of a wall that would be continued farther than they are long."""
+    for end, before, one in ((0, 1, met[0]), (-1, -2, met[1])):
+        length = float(np.hypot(*(line[end] - line[before]))) - beyond
+        if len(runs) > 1 and (one is None or one[0] - length > max(runs[end].length, beyond)):
+            del runs[end]
 
 
 def _drawn(wall: _Wall, beyond: float) -> FloatArray:
