@@ -63,7 +63,7 @@ _MOVED = 1.2
 """Most area between the raw outline and the edges: this many standard deviations of it times its length."""
 _SAME = math.cos(math.radians(3.0))
 _QUARTER = 0.5 * math.pi
-_NONE_MET = np.full(2, np.nan)
+NONE_MET = np.full(2, np.nan)
 """A closed border, or one that ends on nothing."""
 
 
@@ -213,7 +213,7 @@ def described(rings: Sequence[_Ring], spacing_mm: float, noise_mm: float) -> lis
 
 
 def _runs(
-    ring: _Ring, directions: FloatArray, per_mm: float, prices: Prices, met: FloatArray = _NONE_MET
+    ring: _Ring, directions: FloatArray, per_mm: float, prices: Prices, met: FloatArray = NONE_MET
 ) -> tuple[list[Run], float]:
     """The edges of a ring, and the length of their description."""
     ends, of_edge, angles, cost = least_description(ring.border, ring.breaks, directions, per_mm, prices, met)
@@ -231,7 +231,7 @@ def described_chain(
     spacing_mm: float,
     noise_mm: float,
     prices: Prices,
-    met: FloatArray = _NONE_MET,
+    met: FloatArray = NONE_MET,
 ) -> list[Run]:
     """The edges of an open border (n, 2), of which `directions` are common to others; `met` as it is described."""
     step = _BREAK_SPACINGS * spacing_mm

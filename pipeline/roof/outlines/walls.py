@@ -20,19 +20,22 @@ from shapely import LineString, MultiPolygon, Polygon
 
 from pipeline.model import FloatArray, IntArray, LabelArray
 from pipeline.roof.footprint import polygons_of
-from pipeline.roof.lines import Run, corners, crossing, fitted_run
-from pipeline.roof.outlines.description import Prices
-from pipeline.roof.outlines.exterior import described_chain, pairs_of, peaks_of
+from pipeline.roof.lines import Run, corners, fitted_run
+from pipeline.roof.outlines.exterior import NONE_MET, described_chain, pairs_of, peaks_of
+from pipeline.roof.outlines.wall_ends import (
+    PRICES,
+    Scale,
+    Wall,
+    directions_beside,
+    end_outside,
+    ended,
+    met,
+    obstacles_of,
+    put_through_corner,
+    without_stubs,
+)
 from pipeline.roof.partition import RoofPartition
 
-PRICES = Prices(edge=6.0, free=14.0, change=4.0, sharp=60.0, flat=60.0)
-"""A wall inside a block is seen less well than an outline: it costs more to bend it."""
-_NOISE_SPACINGS, _NOISE_M = 0.8, 0.4
-"""Standard deviation of the border between two units about their wall: in point spacings, and at least."""
-_BEYOND_SPACINGS, _BEYOND_M = 1.0, 0.5
-"""How far beyond the outline borders are followed, and walls reach beyond their borders."""
-_FAR_SPACINGS, _FAR_M = 8.0, 6.0
-"""How far a wall is continued until it meets something."""
 _NEARBY_MM = 10_000.0
 """The outline's edges within this of a border give its directions."""
 _IN_LINE_MM = 500.0
@@ -47,28 +50,11 @@ _STRAIGHT_ON = -0.8
 """Cosine between two borders, seen from where they meet: from 143 degrees on, one goes on in the other."""
 _WAY_MM = 2500.0
 """The direction of a border at its end is that of this much of it."""
-_OVERSHOOT_MM = 5.0
-"""Walls end this far beyond what they meet: the lines must cross."""
-_AWAY = np.array([[-1.0, 0.0], [0.0, -1.0], [1.0, 0.0], [0.0, 1.0]])
-"""The way from the first end of an edge (4,) to its second one."""
-_ACUTE = math.cos(math.radians(50.0))
-"""Cosine of the least angle between a wall and the edges of a corner that it is moved to."""
 _LEAST_CELL_MM2 = 2e6
 _LEAST_WIDTH_MM = 500.0
-_LEAST_OWN = 0.5
 """Smaller or narrower cells join the neighbour with the longest common wall."""
-
-
-@dataclasses.dataclass(frozen=True)
-class _Wall:
-    """A border between units and the edges that describe it."""
-
-    border: FloatArray
-    """(n, 2), millimetres."""
-    runs: list[Run]
-    """Its edges."""
-    directions: FloatArray
-    """Those of the outline nearby, radians."""
+_LEAST_OWN = 0.5
+"""Walls do not separate a unit with a smaller share of its points in its cells."""
 
 
 def divided(
@@ -79,44 +65,12 @@ def divided(
     `units` are the surroundings of every unit's points, beyond the outline; `xy_mm` (n, 2), ascending by x, are the
     points, `unit` (n,) their units.
     """
-    spacing_mm = 1e3 * spacing_m
     edges = _edges_of(outline_mm)
-    beyond = max(_BEYOND_SPACINGS * spacing_mm, 1e3 * _BEYOND_M)
-    walls = []
-    for border in _through(_borders(units, shapely.buffer(outline_mm, beyond))):
-        near = edges[shapely.distance(LineString(border), shapely.linestrings(edges.reshape(-1, 2, 2))) <= _NEARBY_MM]
-        directions = pairs_of(peaks_of(_edge_runs(near)))
-        runs = described_chain(border, directions, spacing_mm, _noise_mm(spacing_m), PRICES)
-        walls.append(_Wall(border, runs, directions))
-    _put_in_line(walls, edges, max(_IN_LINE_MM, spacing_mm))
-    lines = [_drawn(wall, beyond) for wall in walls]
-    far = max(_FAR_SPACINGS * spacing_mm, 1e3 * _FAR_M)
-    met = [_beside(k, walls, lines, edges) for k in range(len(lines))]
-    walls = [
-        dataclasses.replace(
-            wall,
-            runs=described_chain(
-                wall.border, wall.directions, spacing_mm, _noise_mm(spacing_m), PRICES, ends
-            ),
-        )
-        for wall, ends in zip(walls, met, strict=True)
-    ]
-    for wall in walls:
-        _end_outside(wall.runs, outline_mm)
-    _put_in_line(walls, edges, max(_IN_LINE_MM, spacing_mm))
-    lines = [_drawn(wall, beyond) for wall in walls]
-    for k, wall in enumerate(walls):
-        _without_stubs(wall.runs, lines[k], _met(k, lines, edges, beyond, far), beyond)
-    lines = [_drawn(wall, beyond) for wall in walls]
-    per_mm = 0.5 / (spacing_mm * _noise_mm(spacing_m) ** 2)
-    for k, wall in enumerate(walls):
-        _put_through_corner(wall, _met(k, lines, edges, beyond, far), edges, per_mm)
-    lines = [_drawn(wall, beyond) for wall in walls]
-    chords = [_ended(k, lines, edges, beyond, far) for k in range(len(lines))]
+    chords = _chords(units, outline_mm, edges, spacing_m)
     cells, owners, lost = _cells(outline_mm, chords, xy_mm, unit)
-    lost = [label for label in np.unique(units.labels).tolist() if label in lost or label not in owners]
+    lost |= set(units.labels.tolist()) - set(owners)
     if lost:
-        # a unit that no wall separates is drawn around its own points
+        # a unit that walls do not separate is drawn around its own points
         directions = pairs_of(peaks_of(_edge_runs(edges), 3))
         around = [
             _drawn_around(polygon.exterior, directions, spacing_m)
@@ -127,21 +81,47 @@ def divided(
     return _united(cells, owners)
 
 
+def _chords(units: RoofPartition, outline_mm: MultiPolygon, edges: FloatArray, spacing_m: float) -> list[FloatArray]:
+    """The walls between units, (n, 2) each; their ends lie on the outline, edges (e, 4), or on other walls."""
+    scale = Scale.of(spacing_m)
+    most = max(_IN_LINE_MM, scale.spacing_mm)
+    walls = []
+    for border in _through(_borders(units, shapely.buffer(outline_mm, scale.beyond_mm))):
+        near = edges[shapely.distance(LineString(border), shapely.linestrings(edges.reshape(-1, 2, 2))) <= _NEARBY_MM]
+        directions = pairs_of(peaks_of(_edge_runs(near)))
+        walls.append(Wall(border, directions, _described(border, directions, scale)))
+    _put_in_line(walls, edges, most)
+    lines = [wall.line(scale) for wall in walls]
+    for k, wall in enumerate(walls):
+        # what it ends on is known once all are drawn
+        ends = directions_beside(wall.border[[0, -1]], obstacles_of(edges, lines, k))
+        walls[k] = dataclasses.replace(wall, runs=_described(wall.border, wall.directions, scale, ends))
+        end_outside(walls[k].runs, outline_mm)
+    _put_in_line(walls, edges, most)
+    for change in (without_stubs, put_through_corner):
+        lines = [wall.line(scale) for wall in walls]
+        for k, wall in enumerate(walls):
+            change(wall, met(lines[k], obstacles_of(edges, lines, k), scale), edges, scale)
+    lines = [wall.line(scale) for wall in walls]
+    return [ended(line, obstacles_of(edges, lines, k), scale) for k, line in enumerate(lines)]
+
+
+def _described(border: FloatArray, directions: FloatArray, scale: Scale, ends: FloatArray = NONE_MET) -> list[Run]:
+    """The edges of a border (n, 2), in some directions or others; it ends on lines with the directions `ends` (2,)."""
+    return described_chain(border, directions, scale.spacing_mm, scale.noise_mm, PRICES, ends)
+
+
 def _drawn_around(ring: shapely.LinearRing, directions: FloatArray, spacing_m: float) -> FloatArray:
     """A closed border (n, 2) with straight edges, in some directions or others; as it is if it has too few edges."""
     border = np.asarray(ring.coords)
     start = int(np.argmax(np.hypot(*(border - border.mean(axis=0)).T)))
     border = np.concatenate((border[start:-1], border[:start]))
     opened = np.concatenate((border, border[:1]))
-    runs = described_chain(opened, directions, 1e3 * spacing_m, _noise_mm(spacing_m), PRICES)
+    runs = _described(opened, directions, Scale.of(spacing_m))
     if len(runs) < 3:
         return opened
     places = np.array(corners(border, runs, math.inf, closed=True))
     return np.concatenate((places, places[:1]))
-
-
-def _noise_mm(spacing_m: float) -> float:
-    return 1e3 * max(_NOISE_SPACINGS * spacing_m, _NOISE_M)
 
 
 def _edges_of(outline_mm: MultiPolygon) -> FloatArray:
@@ -223,7 +203,7 @@ def _way_from(border: FloatArray, at_start: bool) -> FloatArray:
     return np.asarray(way / max(math.hypot(*way.tolist()), 1e-9))
 
 
-def _put_in_line(walls: Sequence[_Wall], edges: FloatArray, most_mm: float) -> None:
+def _put_in_line(walls: Sequence[Wall], edges: FloatArray, most_mm: float) -> None:
     """Move walls onto the line of a parallel edge, or longer wall, that they nearly continue; the longest first."""
     middle = 0.5 * (edges[:, :2] + edges[:, 2:])
     ways = edges[:, 2:] - edges[:, :2]
@@ -244,120 +224,10 @@ def _put_in_line(walls: Sequence[_Wall], edges: FloatArray, most_mm: float) -> N
         known = np.concatenate((known, [[run.x, run.y, ux, uy, run.length]]))
 
 
-def _end_outside(runs: list[Run], outline_mm: MultiPolygon) -> None:
-    """Leave out the edges behind the corners at which a wall has left the outline."""
-    for first, second in ((0, 1), (-1, -2)):
-        while len(runs) > 1:
-            corner = crossing(runs[first], runs[second])
-            if corner is None or shapely.contains_xy(outline_mm, *corner):
-                break
-            del runs[first]
-
-
-def _without_stubs(
-    runs: list[Run], line: FloatArray, met: Sequence[tuple[float, FloatArray] | None], beyond: float
-) -> None:
-    """Leave out edges at the ends of a wall that would be continued farther than they are long."""
-    for end, before, one in ((0, 1, met[0]), (-1, -2, met[1])):
-        length = float(np.hypot(*(line[end] - line[before]))) - beyond
-        if len(runs) > 1 and (one is None or one[0] - length > max(runs[end].length, beyond)):
-            del runs[end]
-
-
-def _drawn(wall: _Wall, beyond: float) -> FloatArray:
-    """The vertices of a wall, both ends reaching beyond its border."""
-    first, last = wall.runs[0], wall.runs[-1]
-    ends = []
-    for run, (x, y), sense in ((first, wall.border[0].tolist(), -1.0), (last, wall.border[-1].tolist(), 1.0)):
-        ux, uy = math.cos(run.direction), math.sin(run.direction)
-        way = (x - run.x) * ux + (y - run.y) * uy + sense * beyond
-        ends.append((run.x + way * ux, run.y + way * uy))
-    between = corners(wall.border, wall.runs, math.inf, closed=False)
-    return np.array([ends[0], *between, ends[1]])
-
-
-def _met(
-    number: int, lines: Sequence[FloatArray], edges: FloatArray, beyond: float, far: float
-) -> tuple[tuple[float, FloatArray] | None, ...]:
-    """What a wall meets nearest to its first end and to its last one, the outline or another wall; None for nothing.
-
-    How far that is from the vertex before, millimetres, and the ends (4,) of what is met.
-    """
-    others = [np.column_stack((line[:-1], line[1:])) for k, line in enumerate(lines) if k != number]
-    obstacles = np.concatenate((edges, *others))
-    line = lines[number]
-    met: list[tuple[float, FloatArray] | None] = []
-    for end, before in ((0, 1), (-1, -2)):
-        way = line[end] - line[before]
-        length = float(np.hypot(*way))
-        if length == 0.0:
-            met.append(None)
-            continue
-        way /= length
-        border_end = length - beyond
-        least = 0.1 * length if len(line) == 2 else -_OVERSHOOT_MM
-        # the places on the ray from the vertex before at which it meets an obstacle
-        ux, uy = obstacles[:, 2] - obstacles[:, 0], obstacles[:, 3] - obstacles[:, 1]
-        det = way[0] * uy - way[1] * ux
-        dx, dy = obstacles[:, 0] - line[before, 0], obstacles[:, 1] - line[before, 1]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            t, u = (dx * uy - dy * ux) / det, (dx * way[1] - dy * way[0]) / det
-        meets = (np.abs(det) > 1e-9) & (u >= 0.0) & (u <= 1.0) & (t > least) & (t <= border_end + far)
-        meets &= t >= border_end - 2.0 * beyond
-        nearest = int(np.argmin(np.where(meets, np.abs(t - border_end), np.inf)))
-        met.append((float(t[nearest]), obstacles[nearest]) if meets[nearest] else None)
-    return tuple(met)
-
-
-def _beside(number: int, walls: Sequence[_Wall], lines: Sequence[FloatArray], edges: FloatArray) -> FloatArray:
-    """The directions (2,) of the edges or other walls that are nearest to the ends of a border, radians."""
-    others = [np.column_stack((line[:-1], line[1:])) for k, line in enumerate(lines) if k != number]
-    obstacles = np.concatenate((edges, *others))
-    pieces = shapely.linestrings(obstacles.reshape(-1, 2, 2))
-    found = []
-    for place in walls[number].border[[0, -1]]:
-        nearest = obstacles[int(np.argmin(shapely.distance(shapely.Point(place), pieces)))]
-        found.append(math.atan2(nearest[3] - nearest[1], nearest[2] - nearest[0]))
-    return np.array(found)
-
-
-def _put_through_corner(
-    wall: _Wall, met: Sequence[tuple[float, FloatArray] | None], edges: FloatArray, per_mm: float
-) -> None:
-    """Move an end of a wall to the corner beside the place where it meets the outline, if that costs less than an edge."""
-    moves = []
-    for run, one, sense in ((wall.runs[0], met[0], 1.0), (wall.runs[-1], met[1], -1.0)):
-        if one is None or not (edges == one[1]).all(axis=1).any():
-            continue
-        inwards = sense * np.array([math.cos(run.direction), math.sin(run.direction)])
-        for corner in one[1].reshape(2, 2):
-            off = inwards[0] * (corner[1] - run.y) - inwards[1] * (corner[0] - run.x)
-            ways = np.concatenate(
-                [edges[(edges[:, k : k + 2] == corner).all(axis=1)] @ turn for k, turn in ((0, _AWAY), (2, -_AWAY))]
-            )
-            if per_mm * run.length * off * off >= PRICES.edge:
-                continue
-            if (ways @ inwards <= _ACUTE * np.hypot(*ways.T)).all():
-                moves.append((abs(off), sense * off, run))
-    for _, off, run in sorted(moves, key=lambda move: move[0])[:1] if wall.runs[0] is wall.runs[-1] else moves:
-        run.x -= off * math.sin(run.direction)
-        run.y += off * math.cos(run.direction)
-
-
-def _ended(number: int, lines: Sequence[FloatArray], edges: FloatArray, beyond: float, far: float) -> FloatArray:
-    """A wall whose ends lie on what they meet."""
-    line = lines[number].copy()
-    for one, end, before in zip(_met(number, lines, edges, beyond, far), (0, -1), (1, -2), strict=True):
-        if one is not None:
-            way = line[end] - line[before]
-            line[end] = line[before] + (one[0] + _OVERSHOOT_MM) / float(np.hypot(*way)) * way
-    return line
-
-
 def _cells(
     outline_mm: MultiPolygon, chords: Iterable[FloatArray], xy_mm: IntArray, unit: LabelArray
 ) -> tuple[list[Polygon], list[int], set[int]]:
-    """The cells between an outline and some walls, the unit of each, and the units with few of their points in theirs."""
+    """The cells between an outline and some walls, the unit of each, and the units that are not separated."""
     drawn = [shapely.boundary(outline_mm), *(LineString(chord) for chord in chords)]
     net = shapely.union_all(drawn, grid_size=1.0)
     shapely.prepare(outline_mm)

@@ -117,7 +117,10 @@ def test_common_directions_are_those_of_most_length() -> None:
 
 
 def described(
-    border: FloatArray, degrees: Sequence[float], prices: Prices = PRICES, met: tuple[float, float] = (math.nan, math.nan)
+    border: FloatArray,
+    degrees: Sequence[float],
+    prices: Prices = PRICES,
+    met: tuple[float, float] = (math.nan, math.nan),
 ) -> tuple[list[int], list[int]]:
     """Where the edges of an open border end, and their directions; it ends on lines that run at `met` degrees."""
     directions = np.radians(np.array(degrees, np.float64))
