@@ -99,14 +99,13 @@ def _turns(directions: FloatArray, prices: Prices) -> FloatArray:
 
 
 @kernel(inline="always")
-def _end_price(angle: float, met: float, prices: Prices) -> float:
-    """The price of an edge that ends on a line met at an angle, which has a side on both hands; nan: it meets none."""
-    cosine, sine = abs(math.cos(angle - met)), abs(math.sin(angle - met))
+def _end_price(angle: float, is_first: bool, is_last: bool, met: FloatArray, prices: Prices) -> float:
+    """The price of the ends of an edge on the lines that the description begins and ends on, which have two sides."""
     price = 0.0
-    if sine < _SQUARE:
-        price += prices.change
-    if cosine > -SHARP:
-        price += prices.sharp
+    for k in range(2):
+        if is_first if k == 0 else is_last:
+            turn = angle - met[k]
+            price += _turn_price(-abs(math.cos(turn)), math.sin(turn), prices)  # no price if it is nan
     return price
 
 
@@ -191,10 +190,7 @@ def least_description(
                 if total >= best[j, state] or abs(along) < _LEAST_PROGRESS * w:
                     continue
                 last = through[i, state]
-                if i == 0:
-                    total += _end_price(angle, met[0], prices)
-                if j == m - 1:
-                    total += _end_price(angle, met[1], prices)
+                total += _end_price(angle, i == 0, j == m - 1, met, prices)
                 if i > 0 and free in (state, last):
                     turn = angle - angles[i, last]
                     total += _turn_price(math.cos(turn), math.sin(turn), prices)

@@ -200,11 +200,12 @@ def described(rings: Sequence[_Ring], spacing_mm: float, noise_mm: float) -> lis
         if better is None or better[0] >= least:
             break
         least, systems, best = better
-    for k, ring in enumerate(rings):
-        if len(best[k]) > 2 and math.cos(best[k][0].direction - best[k][-1].direction) < SHARP:
+    for k, own in enumerate(best):
+        if len(own) > 2 and math.cos(own[0].direction - own[-1].direction) < SHARP:
             # a spike where the ring begins is the only one without a price
-            rings[k] = ring = _begun_at_a_corner(ring, best[k])
-            best[k] = _runs(ring, pairs_of(systems), per_mm, PRICES)[0]
+            rings[k] = _begun_at_a_corner(rings[k], own)
+            best[k] = _runs(rings[k], pairs_of(systems), per_mm, PRICES)[0]
+        ring = rings[k]
         if len(best[k]) < _FEWEST and len(ring.breaks) <= _FEW_BREAKS:
             # a few points never show a triangle: it is the cheapest way to cut the corners of a rectangle
             longest = max(best[k], key=lambda run: run.length).direction if best[k] else 0.0
