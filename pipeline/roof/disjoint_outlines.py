@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 from collections.abc import Iterable, Iterator
 
 import numpy as np
@@ -75,18 +76,21 @@ def divided(first: Claim, second: Claim) -> tuple[MultiPolygon, MultiPolygon]:
     if second.rank < first.rank:
         lower, upper = divided(second, first)
         return upper, lower
-    pieces: list[Polygon] = []
+    to_first: list[Polygon] = []
     to_second: list[Polygon] = []
     for piece in polygons_of(shapely.intersection(first.outline_mm, second.outline_mm, grid_size=1.0)):
         mine, theirs = ([piece], []) if piece.area < _SMALL_MM2 else _shares(piece, first, second)
-        pieces += [*mine, *theirs]
+        to_first += mine
         to_second += theirs
-    net = shapely.union_all(shapely.boundary([first.outline_mm, second.outline_mm, *pieces]), grid_size=1.0)
+    net = shapely.union_all(
+        shapely.boundary([first.outline_mm, second.outline_mm, *to_first, *to_second]), grid_size=1.0
+    )
     cells = np.array(polygons_of(shapely.polygonize(shapely.get_parts(net))), dtype=object)
     places = shapely.point_on_surface(cells)
     is_first = shapely.intersects(first.outline_mm, places)
     is_second = shapely.intersects(second.outline_mm, places)
-    is_first &= ~(is_second & shapely.intersects(MultiPolygon(to_second), places))
+    is_second &= ~shapely.intersects(shapely.union_all(to_first), places)
+    is_first &= ~shapely.intersects(shapely.union_all(to_second), places)
     kept, left = (_united(cells[chosen]) for chosen in (is_first, is_second & ~is_first))
     return kept, left
 
@@ -98,20 +102,27 @@ def _united(cells: np.ndarray[tuple[int], np.dtype[np.object_]]) -> MultiPolygon
 
 
 def _shares(piece: Polygon, first: Claim, second: Claim) -> tuple[list[Polygon], list[Polygon]]:
-    """The shares of both in one piece of their overlap, by the least cost; of equal ones the first is taken."""
+    """What both take from the other in one piece of their overlap, by the least cost; of equal ones the first one."""
     own, other = _inside(piece, first.points_mm), _inside(piece, second.points_mm)
-    options = [([piece], list[Polygon](), len(other)), (list[Polygon](), [piece], len(own))]
+    none: list[Polygon] = []
+    options = [([piece], none, len(other)), (none, [piece], len(own))]
     if min(len(own), len(other)) >= _FEWEST_WRONG:
         options.extend(_chords(piece, own, other))
-    costs = []
+    options.extend((taken, none, wrong) for taken, wrong in _retreats(piece, second))
+    options.extend((none, taken, wrong) for taken, wrong in _retreats(piece, first))
+    whole = [effort(claim.outline_mm) for claim in (first, second)]
+    least, best = math.inf, (none, none)
     for mine, theirs, wrong in options:
         cost = _WRONG_COST * wrong
-        for claim, lost in ((first, theirs), (second, mine)):
-            left = shapely.difference(claim.outline_mm, MultiPolygon(lost), grid_size=1.0) if lost else claim.outline_mm
-            cost += effort(left) + (_BARRED if left.area < _KEPT_SHARE * claim.outline_mm.area else 0.0)
-        costs.append(cost)
-    mine, theirs, _ = options[int(np.argmin(costs))]
-    return mine, theirs
+        for claim, lost, as_drawn in ((first, theirs, whole[0]), (second, mine, whole[1])):
+            if not lost:
+                cost += as_drawn
+            elif cost < least:
+                left = shapely.difference(claim.outline_mm, MultiPolygon(lost), grid_size=1.0)
+                cost += effort(left) + (_BARRED if left.area < _KEPT_SHARE * claim.outline_mm.area else 0.0)
+        if cost < least:
+            least, best = cost, (mine, theirs)
+    return best
 
 
 def _inside(piece: Polygon, points_mm: IntArray) -> IntArray:
@@ -122,6 +133,24 @@ def _inside(piece: Polygon, points_mm: IntArray) -> IntArray:
     near = near[(near[:, 1] >= south) & (near[:, 1] <= north)]
     inside: IntArray = near[shapely.contains_xy(piece, near[:, 0], near[:, 1])]
     return inside
+
+
+def _retreats(piece: Polygon, claim: Claim) -> Iterator[tuple[list[Polygon], int]]:
+    """What a candidate gives up if it ends before a piece, along or square to its longest edge; its points in that."""
+    ring = shapely.get_coordinates(max(claim.outline_mm.geoms, key=lambda part: (part.area, part.bounds)).exterior)
+    edges = np.diff(ring, axis=0)
+    longest = edges[int(np.argmax(np.hypot(edges[:, 0], edges[:, 1])))]
+    reach = 2.0 * float(np.ptp(ring, axis=0).sum()) / np.hypot(*longest)
+    places = shapely.get_coordinates(piece)
+    for _ in range(4):
+        along = np.rint(reach * longest)
+        across = np.array([-along[1], along[0]])
+        nearest = places[int(np.argmin((places - places[0]) @ across))]
+        ends = np.array([nearest - along, nearest + along])
+        beyond = shapely.intersection(claim.outline_mm, Polygon([*ends, *(ends[::-1] + across)]), grid_size=1.0)
+        taken = polygons_of(shapely.union_all([beyond, piece], grid_size=1.0))
+        yield taken, sum(len(_inside(one, claim.points_mm)) for one in taken)
+        longest = across / reach
 
 
 def _chords(piece: Polygon, own: IntArray, other: IntArray) -> Iterator[tuple[list[Polygon], list[Polygon], int]]:

@@ -130,5 +130,6 @@ def steps_of(border: Border, chain: IntArray, directions: FloatArray, spacing_m:
     breaks = np.arange(n + 1 if _is_closed(border, chain) else n)
     noise_mm = 1e3 * max(_NOISE_SPACINGS * spacing_m, _NOISE_M)
     per_mm = 0.5 / (1e3 * spacing_m * noise_mm * noise_mm)
-    ends, _, angles, _ = least_description(1e3 * border.places[chain], breaks, directions, per_mm, PRICES)
+    none_met = np.full(2, np.nan)
+    ends, _, angles, _ = least_description(1e3 * border.places[chain], breaks, directions, per_mm, PRICES, none_met)
     return ends, angles

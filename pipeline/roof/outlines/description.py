@@ -37,7 +37,7 @@ class Prices(NamedTuple):
     """For a turn of less than 12 degrees: the noise of the lines moves such a corner far."""
 
 
-_SHARP = math.cos(math.radians(180.0 - 63.0))
+SHARP = math.cos(math.radians(180.0 - 63.0))
 _FLAT = math.sin(math.radians(12.0))
 _SQUARE = math.sin(math.radians(81.0))
 _LEAST_PROGRESS = 0.3
@@ -73,7 +73,7 @@ def _turn_price(cosine: float, sine: float, prices: Prices) -> float:
     price = 0.0
     if abs(sine) < _SQUARE:
         price += prices.change
-    if cosine < _SHARP:
+    if cosine < SHARP:
         price += prices.sharp
     elif abs(sine) < _FLAT:
         price += prices.flat
@@ -117,9 +117,20 @@ def _turn(best: FloatArray, turns: FloatArray, before: FloatArray, through: IntA
                 before[b], through[b] = total, a
 
 
+@kernel(inline="always")
+def _end_price(angle: float, is_first: bool, is_last: bool, met: FloatArray, prices: Prices) -> float:
+    """The price of the ends of an edge on the lines that the description begins and ends on, which have two sides."""
+    price = 0.0
+    for k in range(2):
+        if is_first if k == 0 else is_last:
+            turn = angle - met[k]
+            price += _turn_price(-abs(math.cos(turn)), math.sin(turn), prices)  # no price if it is nan
+    return price
+
+
 @kernel
 def least_description(
-    border: FloatArray, breaks: IntArray, directions: FloatArray, per_mm: float, prices: Prices
+    border: FloatArray, breaks: IntArray, directions: FloatArray, per_mm: float, prices: Prices, met: FloatArray
 ) -> tuple[IntArray, IntArray, FloatArray, float]:
     """The edges from the first break of a border to the last that are described shortest.
 
@@ -135,6 +146,8 @@ def least_description(
         Nats per millimetre of the border and square millimetre of its distance from the edge.
     prices : Prices
         What edges and turns cost.
+    met : (2,) float64
+        Directions of the lines on which the first edge begins and the last one ends, radians; nan where there is none.
 
     Returns
     -------
@@ -196,6 +209,7 @@ def least_description(
                 if abs(along) < _LEAST_PROGRESS * w:
                     continue
                 last = through[i, state]
+                total += _end_price(angle, i == 0, j == m - 1, met, prices)
                 if i > 0 and free in (state, last):
                     bend = angle - angles[i, last]
                     total += _turn_price(math.cos(bend), math.sin(bend), prices)

@@ -23,7 +23,7 @@ from pipeline.model import FloatArray, IntArray
 from pipeline.roof.edge_position import EdgePoints, mixed_pulse_reach_mm, outward_shift_mm
 from pipeline.roof.footprint import polygons_of
 from pipeline.roof.lines import Run, corners, crossing, fitted_runs, projected
-from pipeline.roof.outlines.description import FREE, Prices, least_description
+from pipeline.roof.outlines.description import FREE, SHARP, Prices, least_description
 from pipeline.roof.roof_settings import RoofSettings
 from pipeline.roof.snapped_rings import differ_by_more, on_grid, snapped_ring
 
@@ -63,6 +63,8 @@ _MOVED = 1.2
 """Most area between the raw outline and the edges: this many standard deviations of it times its length."""
 _SAME = math.cos(math.radians(3.0))
 _QUARTER = 0.5 * math.pi
+NONE_MET = np.full(2, np.nan)
+"""A closed border, or one that ends on nothing."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -141,7 +143,7 @@ def _straight_rings(
 
 def _of_few_points(border: FloatArray, spacing_m: float, points: EdgePoints, noise_mm: float) -> FloatArray | None:
     """The likeliest ring around few points: as described, or in two directions of any."""
-    from pipeline.roof.outlines.few_points import directions, envelope_mm, likeliest
+    from pipeline.roof.outlines.few_points import directions, envelope_mm, likeliest, sharp_corners
 
     raw = Polygon(border)
     area_mm2, most_mm2 = raw.area, 4.0 * _MOVED * noise_mm * raw.length
@@ -162,7 +164,7 @@ def _of_few_points(border: FloatArray, spacing_m: float, points: EdgePoints, noi
         found = _ring_of(along, runs, least, most_mm2) if len(runs) >= _FEWEST else None
         if found is not None:
             free = sum(not run.exact for run in runs)
-            cost = PRICES.edge * len(found) + PRICES.free * free
+            cost = PRICES.edge * len(found) + PRICES.free * free + PRICES.sharp * sharp_corners(found)
             drawings.append((cost, found))
     return likeliest(drawings, xy_mm, spacing_m)
 
@@ -197,7 +199,12 @@ def described(rings: Sequence[_Ring], spacing_mm: float, noise_mm: float) -> lis
         if better is None or better[0] >= least:
             break
         least, systems, best = better
-    for k, ring in enumerate(rings):
+    for k, own in enumerate(best):
+        if len(own) > 2 and math.cos(own[0].direction - own[-1].direction) < SHARP:
+            # a spike where the ring begins is the only one without a price
+            rings[k] = _begun_at_a_corner(rings[k], own)
+            best[k] = _runs(rings[k], pairs_of(systems), per_mm, PRICES)[0]
+        ring = rings[k]
         if len(best[k]) < _FEWEST and len(ring.breaks) <= _FEW_BREAKS:
             # a few points never show a triangle: it is the cheapest way to cut the corners of a rectangle
             longest = max(best[k], key=lambda run: run.length).direction if best[k] else 0.0
@@ -205,9 +212,11 @@ def described(rings: Sequence[_Ring], spacing_mm: float, noise_mm: float) -> lis
     return [(ring.border, own) for ring, own in zip(rings, best, strict=True)]
 
 
-def _runs(ring: _Ring, directions: FloatArray, per_mm: float, prices: Prices) -> tuple[list[Run], float]:
+def _runs(
+    ring: _Ring, directions: FloatArray, per_mm: float, prices: Prices, met: FloatArray = NONE_MET
+) -> tuple[list[Run], float]:
     """The edges of a ring, and the length of their description."""
-    ends, of_edge, angles, cost = least_description(ring.border, ring.breaks, directions, per_mm, prices)
+    ends, of_edge, angles, cost = least_description(ring.border, ring.breaks, directions, per_mm, prices, met)
     runs = fitted_runs(ring.border, ring.breaks[ends])
     for run, index, angle in zip(runs, of_edge.tolist(), angles.tolist(), strict=True):
         run.direction, run.exact = angle, index != FREE
@@ -215,14 +224,19 @@ def _runs(ring: _Ring, directions: FloatArray, per_mm: float, prices: Prices) ->
 
 
 def described_chain(
-    border: FloatArray, directions: FloatArray, spacing_mm: float, noise_mm: float, prices: Prices
+    border: FloatArray,
+    directions: FloatArray,
+    spacing_mm: float,
+    noise_mm: float,
+    prices: Prices,
+    met: FloatArray = NONE_MET,
 ) -> list[Run]:
-    """The edges of an open border (n, 2), of which `directions` are common to others."""
+    """The edges of an open border (n, 2), of which `directions` are common to others; `met` as it is described."""
     step = _BREAK_SPACINGS * spacing_mm
     breaks = breaks_of(border, step)[:-1]
     breaks = np.append(breaks[:-1] if len(breaks) > 1 else breaks, len(border) - 1)
     per_mm = 0.5 / (spacing_mm * noise_mm * noise_mm)
-    return _runs(_Ring(border=border, breaks=breaks), directions, per_mm, prices)[0]
+    return _runs(_Ring(border=border, breaks=breaks), directions, per_mm, prices, met)[0]
 
 
 def pairs_of(systems: Sequence[float]) -> FloatArray:
@@ -317,11 +331,16 @@ def _take_positions(border: FloatArray, runs: Sequence[Run], points: EdgePoints,
 def without_short(border: FloatArray, runs: Sequence[Run], least_mm: float) -> list[Run]:
     """The edges of a closed border without those that are shorter between their corners, the shortest first.
 
-    Where the neighbours of such an edge are parallel, they are one edge.
+    Where the neighbours of such an edge are parallel, they are one edge; where they would meet in a spike, it stays.
     """
     left = list(runs)
     while len(left) > 4:
-        lengths = [_length_between(border, left, k) for k in range(len(left))]
+        lengths = [
+            math.inf
+            if math.cos(left[(k + 1) % len(left)].direction - left[k - 1].direction) < SHARP
+            else _length_between(border, left, k)
+            for k in range(len(left))
+        ]
         k = min(range(len(left)), key=lengths.__getitem__)
         if lengths[k] >= least_mm:
             break

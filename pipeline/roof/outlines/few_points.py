@@ -16,6 +16,7 @@ import shapely
 from pipeline.compiler import kernel
 from pipeline.model import FloatArray
 from pipeline.roof.lines import Run
+from pipeline.roof.outlines.description import SHARP
 
 _OFF_MM = 120.0
 """Standard deviation of a point about the edge that it lies outside of."""
@@ -73,6 +74,14 @@ def _envelope(
             best, least = off, a_mm * off + outside
     # the edge lies beyond its outermost point by the mean way to the next one
     return float(best + min(1.0 / a_mm, 0.5 * out))
+
+
+def sharp_corners(ring: FloatArray) -> int:
+    """The number of inner angles below 63 degrees of a ring (n, 2)."""
+    edges = ring - np.roll(ring, 1, axis=0)
+    cosine = (edges * np.roll(edges, -1, axis=0)).sum(axis=1)
+    lengths = np.hypot(edges[:, 0], edges[:, 1])
+    return int(np.count_nonzero(cosine < SHARP * lengths * np.roll(lengths, -1)))
 
 
 def likeliest(drawings: Iterable[tuple[float, FloatArray]], xy_mm: FloatArray, spacing_m: float) -> FloatArray | None:

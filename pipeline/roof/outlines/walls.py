@@ -23,19 +23,22 @@ from pipeline.errors import BuildingError
 from pipeline.model import FloatArray, IntArray, LabelArray
 from pipeline.roof.footprint import polygons_of
 from pipeline.roof.lines import Run, corners, fitted_run
-from pipeline.roof.outlines.description import Prices
-from pipeline.roof.outlines.exterior import described_chain, pairs_of, peaks_of
+from pipeline.roof.outlines.exterior import NONE_MET, described_chain, pairs_of, peaks_of
+from pipeline.roof.outlines.wall_ends import (
+    PRICES,
+    Scale,
+    Wall,
+    directions_beside,
+    end_outside,
+    ended,
+    met,
+    obstacles_of,
+    put_through_corner,
+    without_stubs,
+)
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.simplification import unite_close_vertices
 
-PRICES = Prices(edge=6.0, free=14.0, change=4.0, sharp=60.0, flat=60.0)
-"""A wall inside a block is seen less well than an outline: it costs more to bend it."""
-_NOISE_SPACINGS, _NOISE_M = 0.8, 0.4
-"""Standard deviation of the border between two units about their wall: in point spacings, and at least."""
-_BEYOND_SPACINGS, _BEYOND_M = 2.0, 1.0
-"""How far beyond the outline borders are followed, and walls reach beyond their borders."""
-_FAR_SPACINGS, _FAR_M = 8.0, 6.0
-"""How far a wall is continued until it meets something."""
 _NEARBY_MM = 10_000.0
 """The outline's edges within this of a border give its directions."""
 _IN_LINE_MM = 500.0
@@ -50,23 +53,13 @@ _STRAIGHT_ON = -0.8
 """Cosine between two borders, seen from where they meet: from 143 degrees on, one goes on in the other."""
 _WAY_MM = 2500.0
 """The direction of a border at its end is that of this much of it."""
-_OVERSHOOT_MM = 5.0
-"""Walls end this far beyond what they meet: the lines must cross."""
 _CLOSE_MM = 10.0
 """Corners of cells this near to each other are one."""
 _LEAST_CELL_MM2 = 2e6
 _LEAST_WIDTH_MM = 500.0
 """Smaller or narrower cells join the neighbour with the longest common wall."""
-
-
-@dataclasses.dataclass(frozen=True)
-class _Wall:
-    """A border between units and the edges that describe it."""
-
-    border: FloatArray
-    """(n, 2), millimetres."""
-    runs: list[Run]
-    """Its edges."""
+_LEAST_OWN = 0.5
+"""Walls do not separate a unit with a smaller share of its points in its cells."""
 
 
 def divided(
@@ -77,30 +70,50 @@ def divided(
     `units` are the surroundings of every unit's points, beyond the outline; `xy_mm` (n, 2), ascending by x, are the
     points, `unit` (n,) their units.
     """
-    spacing_mm = 1e3 * spacing_m
     edges = _edges_of(outline_mm)
-    beyond = max(_BEYOND_SPACINGS * spacing_mm, 1e3 * _BEYOND_M)
-    walls = []
-    for border in _through(_borders(units, shapely.buffer(outline_mm, beyond))):
-        near = edges[shapely.distance(LineString(border), shapely.linestrings(edges.reshape(-1, 2, 2))) <= _NEARBY_MM]
-        runs = described_chain(border, pairs_of(peaks_of(_edge_runs(near))), spacing_mm, _noise_mm(spacing_m), PRICES)
-        walls.append(_Wall(border, runs))
-    _put_in_line(walls, edges, max(_IN_LINE_MM, spacing_mm))
-    lines = [_drawn(wall, beyond) for wall in walls]
-    far = max(_FAR_SPACINGS * spacing_mm, 1e3 * _FAR_M)
-    chords = [_ended(k, lines, edges, beyond, far) for k in range(len(lines))]
-    cells, owners = _cells(outline_mm, chords, xy_mm, unit)
-    lost = set(units.labels.tolist()) - set(owners)
+    chords = _chords(units, outline_mm, edges, spacing_m)
+    cells, owners, lost = _cells(outline_mm, chords, xy_mm, unit)
+    lost |= set(units.labels.tolist()) - set(owners)
     if lost:
-        # a unit that no wall separates is drawn around its own points
+        # a unit that walls do not separate is drawn around its own points
         directions = pairs_of(peaks_of(_edge_runs(edges), 3))
         around = [
             _drawn_around(polygon.exterior, directions, spacing_m)
             for polygon, label in zip(units.polygons, units.labels.tolist(), strict=True)
             if label in lost
         ]
-        cells, owners = _cells(outline_mm, [*chords, *around], xy_mm, unit)
+        cells, owners, _ = _cells(outline_mm, [*chords, *around], xy_mm, unit)
     return _united(cells, owners)
+
+
+def _chords(units: RoofPartition, outline_mm: MultiPolygon, edges: FloatArray, spacing_m: float) -> list[FloatArray]:
+    """The walls between units, (n, 2) each; their ends lie on the outline, edges (e, 4), or on other walls."""
+    scale = Scale.of(spacing_m)
+    most = max(_IN_LINE_MM, scale.spacing_mm)
+    walls = []
+    for border in _through(_borders(units, shapely.buffer(outline_mm, scale.beyond_mm))):
+        near = edges[shapely.distance(LineString(border), shapely.linestrings(edges.reshape(-1, 2, 2))) <= _NEARBY_MM]
+        directions = pairs_of(peaks_of(_edge_runs(near)))
+        walls.append(Wall(border, directions, _described(border, directions, scale)))
+    _put_in_line(walls, edges, most)
+    lines = [wall.line(scale) for wall in walls]
+    for k, wall in enumerate(walls):
+        # what it ends on is known once all are drawn
+        ends = directions_beside(wall.border[[0, -1]], obstacles_of(edges, lines, k))
+        walls[k] = dataclasses.replace(wall, runs=_described(wall.border, wall.directions, scale, ends))
+        end_outside(walls[k].runs, outline_mm)
+    _put_in_line(walls, edges, most)
+    for change in (without_stubs, put_through_corner):
+        lines = [wall.line(scale) for wall in walls]
+        for k, wall in enumerate(walls):
+            change(wall, met(lines[k], obstacles_of(edges, lines, k), scale), edges, scale)
+    lines = [wall.line(scale) for wall in walls]
+    return [ended(line, obstacles_of(edges, lines, k), scale) for k, line in enumerate(lines)]
+
+
+def _described(border: FloatArray, directions: FloatArray, scale: Scale, ends: FloatArray = NONE_MET) -> list[Run]:
+    """The edges of a border (n, 2), in some directions or others; it ends on lines with the directions `ends` (2,)."""
+    return described_chain(border, directions, scale.spacing_mm, scale.noise_mm, PRICES, ends)
 
 
 def _drawn_around(ring: shapely.LinearRing, directions: FloatArray, spacing_m: float) -> FloatArray:
@@ -109,15 +122,11 @@ def _drawn_around(ring: shapely.LinearRing, directions: FloatArray, spacing_m: f
     start = int(np.argmax(np.hypot(*(border - border.mean(axis=0)).T)))
     border = np.concatenate((border[start:-1], border[:start]))
     opened = np.concatenate((border, border[:1]))
-    runs = described_chain(opened, directions, 1e3 * spacing_m, _noise_mm(spacing_m), PRICES)
+    runs = _described(opened, directions, Scale.of(spacing_m))
     if len(runs) < 3:
         return opened
     places = np.array(corners(border, runs, math.inf, closed=True))
     return np.concatenate((places, places[:1]))
-
-
-def _noise_mm(spacing_m: float) -> float:
-    return 1e3 * max(_NOISE_SPACINGS * spacing_m, _NOISE_M)
 
 
 def _edges_of(outline_mm: MultiPolygon) -> FloatArray:
@@ -225,7 +234,7 @@ def _way_from(border: FloatArray, at_start: bool) -> FloatArray:
     return np.asarray(way / max(math.hypot(*way.tolist()), 1e-9))
 
 
-def _put_in_line(walls: Sequence[_Wall], edges: FloatArray, most_mm: float) -> None:
+def _put_in_line(walls: Sequence[Wall], edges: FloatArray, most_mm: float) -> None:
     """Move walls onto the line of a parallel edge, or longer wall, that they nearly continue; the longest first."""
     middle = 0.5 * (edges[:, :2] + edges[:, 2:])
     ways = edges[:, 2:] - edges[:, :2]
@@ -246,49 +255,10 @@ def _put_in_line(walls: Sequence[_Wall], edges: FloatArray, most_mm: float) -> N
         known = np.concatenate((known, [[run.x, run.y, ux, uy, run.length]]))
 
 
-def _drawn(wall: _Wall, beyond: float) -> FloatArray:
-    """The vertices of a wall, both ends reaching beyond its border."""
-    first, last = wall.runs[0], wall.runs[-1]
-    ends = []
-    for run, (x, y), sense in ((first, wall.border[0].tolist(), -1.0), (last, wall.border[-1].tolist(), 1.0)):
-        ux, uy = math.cos(run.direction), math.sin(run.direction)
-        way = (x - run.x) * ux + (y - run.y) * uy + sense * beyond
-        ends.append((run.x + way * ux, run.y + way * uy))
-    between = corners(wall.border, wall.runs, math.inf, closed=False)
-    return np.array([ends[0], *between, ends[1]])
-
-
-def _ended(number: int, lines: Sequence[FloatArray], edges: FloatArray, beyond: float, far: float) -> FloatArray:
-    """A wall whose ends lie on what they meet nearest to them, the outline or another wall."""
-    others = [np.column_stack((line[:-1], line[1:])) for k, line in enumerate(lines) if k != number]
-    obstacles = np.concatenate((edges, *others))
-    line = lines[number].copy()
-    for end, before in ((0, 1), (-1, -2)):
-        way = line[end] - line[before]
-        length = float(np.hypot(*way))
-        if length == 0.0:
-            continue
-        way /= length
-        border_end = length - beyond
-        # the places on the ray from the vertex before at which it meets an obstacle
-        ux, uy = obstacles[:, 2] - obstacles[:, 0], obstacles[:, 3] - obstacles[:, 1]
-        det = way[0] * uy - way[1] * ux
-        dx, dy = obstacles[:, 0] - line[before, 0], obstacles[:, 1] - line[before, 1]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            t, u = (dx * uy - dy * ux) / det, (dx * way[1] - dy * way[0]) / det
-        meets = (np.abs(det) > 1e-9) & (u >= 0.0) & (u <= 1.0) & (t > 0.1 * length) & (t <= border_end + far)
-        meets &= t >= border_end - 2.0 * beyond
-        if meets.any():
-            at = t[meets]
-            place = float(at[np.argmin(np.abs(at - border_end))])
-            line[end] = line[before] + (place + _OVERSHOOT_MM) * way
-    return line
-
-
 def _cells(
     outline_mm: MultiPolygon, chords: Iterable[FloatArray], xy_mm: IntArray, unit: LabelArray
-) -> tuple[list[Polygon], list[int]]:
-    """The cells between an outline and some walls, and the unit of each."""
+) -> tuple[list[Polygon], list[int], set[int]]:
+    """The cells between an outline and some walls, the unit of each, and the units that are not separated."""
     drawn = [shapely.boundary(outline_mm), *(LineString(chord) for chord in chords)]
     net = shapely.union_all(drawn, grid_size=1.0)
     shapely.prepare(outline_mm)
@@ -298,7 +268,8 @@ def _cells(
         if shapely.contains(outline_mm, shapely.point_on_surface(cell))
     ]
     count = int(unit.max(initial=0)) + 1
-    owners = [_owner(cell, xy_mm, unit, count) for cell in cells]
+    counts = np.array([_counts(cell, xy_mm, unit, count) for cell in cells]).reshape(-1, count)
+    owners = np.where(counts.any(axis=1), counts.argmax(axis=1), -1).tolist()
     order = sorted(range(len(cells)), key=lambda k: (cells[k].area, cells[k].bounds))
     tree = shapely.STRtree(cells)
     for k in order:
@@ -307,7 +278,8 @@ def _cells(
     # cells amid others without points: each round joins those that touch a cell of a unit
     while sum(owners[k] < 0 and _join_neighbour(k, cells, owners, tree) for k in order):
         pass
-    return cells, owners
+    own = np.bincount(np.maximum(owners, 0), weights=counts[np.arange(len(owners)), owners], minlength=count)
+    return cells, owners, set(np.flatnonzero(own < _LEAST_OWN * counts.sum(axis=0)).tolist())
 
 
 def _join_neighbour(k: int, cells: Sequence[Polygon], owners: list[int], tree: shapely.STRtree) -> bool:
@@ -326,14 +298,14 @@ def _is_narrow(cell: Polygon) -> bool:
     return bool(shapely.is_empty(shapely.buffer(cell, -0.5 * _LEAST_WIDTH_MM)))
 
 
-def _owner(cell: Polygon, xy_mm: IntArray, unit: LabelArray, count: int) -> int:
-    """The unit that has most points in a cell; -1 where none has any."""
+def _counts(cell: Polygon, xy_mm: IntArray, unit: LabelArray, count: int) -> IntArray:
+    """The number of points of every unit in a cell."""
     left, bottom, right, top = cell.bounds
     low, high = np.searchsorted(xy_mm[:, 0], [left, right + 1.0])
     xy, of = xy_mm[low:high], unit[low:high]
     inside = (xy[:, 1] >= bottom) & (xy[:, 1] <= top) & (of >= 0)
     inside[inside] = shapely.contains_xy(cell, xy[inside].astype(np.float64))
-    return int(np.bincount(of[inside], minlength=count).argmax()) if inside.any() else -1
+    return np.bincount(of[inside], minlength=count)
 
 
 def _united(cells: Sequence[Polygon], owners: Sequence[int]) -> dict[int, MultiPolygon]:

@@ -125,6 +125,21 @@ def test_an_overlap_with_points_of_both_is_divided_between_them() -> None:
         assert shapely.intersects_xy(one, own.points_mm[:, 0], own.points_mm[:, 1]).all()
 
 
+@pytest.mark.parametrize(("lowest_m", "spacing_m", "expected"), [(1.0, 2.0, 4), (-0.2, 0.25, 5)])
+def test_a_house_ends_before_another_along_its_own_edges_unless_its_points_lie_beyond(
+    lowest_m: float, spacing_m: float, expected: int
+) -> None:
+    wall = claim("wall", rotate(shapely.box(-20, -6, 20, 0), 30.0, origin=(0, 0)), 6.0)
+    house = claim("house", shapely.box(-6, lowest_m, 0, 11), 5.0, shapely.box(-7, -0.5, 1, 12), spacing_m)
+    free = ~shapely.intersects_xy(wall.outline_mm, house.points_mm[:, 0], house.points_mm[:, 1])
+    house = Claim(name="house", outline_mm=house.outline_mm, points_mm=house.points_mm[free])
+    outlines = resolved((wall, house))
+    assert overlap_m2(outlines) == 0.0
+    assert corners(outlines[1]) == expected
+    inside = shapely.intersects_xy(outlines[1], house.points_mm[:, 0], house.points_mm[:, 1])
+    assert np.count_nonzero(~inside) <= 1
+
+
 def test_needles_and_small_parts_are_left_out() -> None:
     wall = claim("wall", shapely.box(0, 0, 20, 6), 9.0)
     # only a strip of 0.15 m and a part of a square metre remain of it beyond the wall

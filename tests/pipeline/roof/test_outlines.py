@@ -116,11 +116,16 @@ def test_common_directions_are_those_of_most_length() -> None:
     assert peaks_of([]) == []
 
 
-def described(border: FloatArray, degrees: Sequence[float], prices: Prices = PRICES) -> tuple[list[int], list[int]]:
-    """Where the edges of an open border end, and their directions."""
+def described(
+    border: FloatArray,
+    degrees: Sequence[float],
+    prices: Prices = PRICES,
+    met: tuple[float, float] = (math.nan, math.nan),
+) -> tuple[list[int], list[int]]:
+    """Where the edges of an open border end, and their directions; it ends on lines that run at `met` degrees."""
     directions = np.radians(np.array(degrees, np.float64))
     ends, of_edge, _, _ = least_description(
-        border, np.arange(len(border)), directions, 0.5 / (500.0 * 200.0**2), prices
+        border, np.arange(len(border)), directions, 0.5 / (500.0 * 200.0**2), prices, np.radians(met)
     )
     return ends.tolist(), of_edge.tolist()
 
@@ -137,6 +142,16 @@ def test_a_zigzag_is_one_edge_and_a_corner_two() -> None:
 def test_an_edge_takes_a_direction_of_its_own_where_its_length_shows_it(rise: float, expected: int) -> None:
     x = np.arange(0, 20_001, 500.0)
     assert described(np.column_stack((x, rise * x)), [0.0, 90.0]) == ([0, 40], [expected])
+
+
+def test_a_border_ends_square_on_what_it_meets_unless_it_is_surely_oblique() -> None:
+    x = np.arange(0, 3001, 500.0)
+    # amid two directions, the one that is square to the line at its end
+    between = np.column_stack((x, math.tan(math.radians(8.0)) * x))
+    assert described(between, [0.0, 16.0], met=(math.nan, 106.0))[1] == [1]
+    assert described(between, [0.0, 16.0], met=(90.0, math.nan))[1] == [0]
+    oblique = np.column_stack((8.0 * x, 8.0 * math.tan(math.radians(35.0)) * x))
+    assert described(oblique, [0.0, 35.0, 90.0], met=(0.0, 0.0))[1] == [1]
 
 
 def test_a_small_bump_is_not_described() -> None:

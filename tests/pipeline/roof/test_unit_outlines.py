@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import shapely
+from shapely import LineString, MultiPolygon, Polygon
 
 from pipeline.model import Candidate, FloatArray, LabelArray
 from pipeline.roof.roof_settings import RoofSettings
@@ -74,3 +75,55 @@ def test_an_overlap_of_strips_does_not_comb_the_outline() -> None:
     assert outline is not None
     assert outline.area == pytest.approx(600.0, rel=0.08)
     assert outline.length == pytest.approx(100.0, rel=0.1)
+
+
+def inner_angles(outline: MultiPolygon) -> FloatArray:
+    """The inner angles of an outline of one part, degrees, without those of almost straight corners."""
+    (polygon,) = shapely.get_parts(shapely.simplify(outline, 0.05))
+    ring = shapely.get_coordinates(polygon.exterior)[:-1]
+    into, out = ring - np.roll(ring, 1, axis=0), np.roll(ring, -1, axis=0) - ring
+    cosine = -(into * out).sum(axis=1) / np.hypot(*into.T) / np.hypot(*out.T)
+    return np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+
+
+def two_units(roof: Polygon, wall: LineString, per_m2: float, seed: int) -> tuple[Candidate, LabelArray]:
+    """Points all over a roof; unit 1 lies right of a wall from below to above."""
+    random = np.random.default_rng(seed)
+    left, bottom, right, top = roof.bounds
+    count = int(per_m2 * (right - left) * (top - bottom))
+    xy = random.uniform((left, bottom), (right, top), (count, 2)).round(3)
+    xy = xy[shapely.contains_xy(roof, xy)]
+    (x0, y0), (x1, y1) = wall.coords
+    unit = ((x1 - x0) * (xy[:, 1] - y0) - (y1 - y0) * (xy[:, 0] - x0) < 0.0).astype(np.int32)
+    return candidate_of(np.column_stack((xy, 6.0 + 3.0 * unit))), unit
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_wall_amid_few_points_leaves_no_wedge(seed: int) -> None:
+    candidate, unit = two_units(shapely.box(0, 0, 22, 11), LineString([(11, 0), (11, 11)]), 0.3, seed)
+    for outline in unit_outlines(candidate, unit, RoofSettings()):
+        assert outline is not None
+        angles = inner_angles(outline)
+        assert len(angles) > 3
+        assert angles.min() > 45.0
+
+
+def test_an_oblique_wall_that_many_points_show_stays_so() -> None:
+    candidate, unit = two_units(shapely.box(0, 0, 22, 11), LineString([(5, 0), (17, 11)]), 8.0, 3)
+    left, right = unit_outlines(candidate, unit, RoofSettings())
+    assert left is not None
+    assert right is not None
+    common = shapely.intersection(left, right, grid_size=0.001)
+    (x0, y0), (x1, y1) = common.bounds[:2], common.bounds[2:]
+    assert np.degrees(np.arctan2(y1 - y0, x1 - x0)) == pytest.approx(42.5, abs=5.0)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_wall_ends_at_the_inner_corner_of_an_outline(seed: int) -> None:
+    roof = Polygon([(0, 0), (22, 0), (22, 14), (16, 14), (12, 9), (0, 9)])
+    candidate, unit = two_units(roof, LineString([(12, 0), (12, 14)]), 3.0, seed)
+    both = unit_outlines(candidate, unit, RoofSettings())
+    corners = shapely.points(shapely.get_coordinates(shapely.simplify(shapely.union_all(both), 0.05)))
+    corner = corners[int(np.argmin(shapely.distance(corners, shapely.Point(12, 9))))]
+    assert shapely.distance(corner, shapely.Point(12, 9)) < 1.0
+    assert shapely.distance(corner, shapely.intersection(*both, grid_size=0.001)) < 0.02
