@@ -23,6 +23,8 @@ _FACING_MM = 500.0
 """A slit runs at least this far along both outlines."""
 _ROUNDING_MM = 1.5
 """Corners that lie on an edge are within this of it."""
+_APART_MM, _MARGIN_MM = 2.0, 1.2
+"""What is taken keeps so far away from others, and a margin around it is narrower, after rounding, too."""
 _MITRE = 6.0
 """Offset corners sharper than 20 degrees are cut."""
 
@@ -123,11 +125,11 @@ def closed(
 
 
 def without(area: Polygon, others: Sequence[shapely.Geometry]) -> list[Polygon]:
-    """An area apart from others by a millimetre, in integer millimetres."""
-    near = [other for other in others if shapely.dwithin(area, other, _ROUNDING_MM)]
+    """An area apart from others, in integer millimetres."""
+    near = [other for other in others if shapely.dwithin(area, other, _APART_MM)]
     if not near:
         return [area]
-    wider = shapely.buffer(shapely.union_all(near, grid_size=1.0), _ROUNDING_MM, join_style="mitre")
+    wider = shapely.buffer(shapely.union_all(near, grid_size=1.0), _APART_MM, join_style="mitre")
     return polygons_of(shapely.difference(area, wider, grid_size=1.0))
 
 
@@ -139,6 +141,17 @@ def united(outline_mm: MultiPolygon, pieces: Sequence[Polygon]) -> MultiPolygon:
     for distance in (_ROUNDING_MM, -_ROUNDING_MM):
         whole = shapely.buffer(whole, distance, join_style="mitre", mitre_limit=_MITRE)
     return MultiPolygon(polygons_of(shapely.transform(whole, _near_grid)))
+
+
+def widened(kept_mm: MultiPolygon, pieces: Sequence[Polygon]) -> MultiPolygon:
+    """What an outline keeps beside another one, with pieces of slits that others border, and a margin around these.
+
+    Nothing else lies in the margin: what is taken keeps farther away from others.
+    """
+    if not pieces:
+        return kept_mm
+    wider = shapely.buffer(pieces, _MARGIN_MM, join_style="mitre", mitre_limit=_MITRE)
+    return MultiPolygon(polygons_of(shapely.union_all([kept_mm, *wider])))
 
 
 def _near_grid(xy: FloatArray) -> FloatArray:

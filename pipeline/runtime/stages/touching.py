@@ -24,7 +24,7 @@ from pipeline.prepared_cloud import prepare_cloud
 from pipeline.roof.disjoint_outlines import Claim, divided, left_of
 from pipeline.roof.plan import drawn_outline, roof_points
 from pipeline.roof.roof_settings import RoofSettings
-from pipeline.roof.slits import GAP_MM, Slit, between, closed, slits, united, without
+from pipeline.roof.slits import GAP_MM, Slit, between, closed, slits, united, widened, without
 from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import OpenScratch, Scratch
 from pipeline.runtime.scratch.outcomes import Files, InParts, Place, brief_within, drop_outcomes, key_of
@@ -203,7 +203,7 @@ def _outlines_of(
         if k < owned:
             gained = {j: pieces for (of, j), pieces in taken.items() if of == k}
             limits = [
-                united(shape, [piece for other, pieces in gained.items() if other != j for piece in pieces])
+                widened(shape, [piece for other, pieces in gained.items() if other != j for piece in pieces])
                 for j, shape in kept[k].items()
             ]
             cut = functools.partial(left_of, drawn[k], limits, task.roof.min_part_area_m2)
