@@ -9,6 +9,7 @@ overlap.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import itertools
 import math
@@ -18,12 +19,14 @@ import numpy as np
 import shapely
 from shapely import LineString, MultiPolygon, Polygon
 
+from pipeline.errors import BuildingError
 from pipeline.model import FloatArray, IntArray, LabelArray
 from pipeline.roof.footprint import polygons_of
 from pipeline.roof.lines import Run, corners, fitted_run
 from pipeline.roof.outlines.description import Prices
 from pipeline.roof.outlines.exterior import described_chain, pairs_of, peaks_of
 from pipeline.roof.partition import RoofPartition
+from pipeline.roof.simplification import unite_close_vertices
 
 PRICES = Prices(edge=6.0, free=14.0, change=4.0, sharp=60.0, flat=60.0)
 """A wall inside a block is seen less well than an outline: it costs more to bend it."""
@@ -49,6 +52,8 @@ _WAY_MM = 2500.0
 """The direction of a border at its end is that of this much of it."""
 _OVERSHOOT_MM = 5.0
 """Walls end this far beyond what they meet: the lines must cross."""
+_CLOSE_MM = 10.0
+"""Corners of cells this near to each other are one."""
 _LEAST_CELL_MM2 = 2e6
 _LEAST_WIDTH_MM = 500.0
 """Smaller or narrower cells join the neighbour with the longest common wall."""
@@ -332,9 +337,12 @@ def _owner(cell: Polygon, xy_mm: IntArray, unit: LabelArray, count: int) -> int:
 
 
 def _united(cells: Sequence[Polygon], owners: Sequence[int]) -> dict[int, MultiPolygon]:
-    """The cells of each unit as one shape."""
+    """The cells of each unit as one shape, without edges that a solid cannot have."""
+    drawn = RoofPartition(polygons=tuple(cells), labels=np.array(owners, np.int32))
+    with contextlib.suppress(BuildingError):  # where a cell breaks, all corners stay
+        drawn = unite_close_vertices(drawn, _CLOSE_MM)
+    polygons = np.array(drawn.polygons, dtype=object)
     found = {}
-    for number in sorted(set(owners) - {-1}):
-        own = [cell for cell, owner in zip(cells, owners, strict=True) if owner == number]
-        found[number] = MultiPolygon(polygons_of(shapely.union_all(own, grid_size=1.0)))
+    for number in sorted(set(drawn.labels.tolist()) - {-1}):
+        found[number] = MultiPolygon(polygons_of(shapely.coverage_union_all(polygons[drawn.labels == number])))
     return found
