@@ -51,7 +51,7 @@ def fitted_run(border: FloatArray, first: int, last: int) -> Run:
 def fitted_runs(border: FloatArray, ends: IntArray) -> list[Run]:
     """The lines through the stretches between each two vertices that follow one another, (e + 1,)."""
     lines, pairs = _fits(border, ends).tolist(), itertools.pairwise(ends.tolist())
-    return [Run(first, last, *line, own=line[2]) for (first, last), line in zip(pairs, lines, strict=True)]
+    return [Run(a, b, x, y, way, long, own=way) for (a, b), (x, y, way, long) in zip(pairs, lines, strict=True)]
 
 
 @kernel

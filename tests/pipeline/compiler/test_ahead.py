@@ -10,7 +10,7 @@ import numba
 import numpy as np
 import pytest
 
-from pipeline.compiler import Kernel, store, warm_up
+from pipeline.compiler import Kernel, store, storing, warm_up
 from pipeline.compiler.kernel import kernel_named
 from pipeline.compiler.signatures import from_json, to_json
 from pipeline.errors import RunError
@@ -115,7 +115,7 @@ def test_a_folder_of_kernels_that_cannot_be_written_is_named(tmp_path: Path, mon
         folder.mkdir(exist_ok=True)
         return 1
 
-    monkeypatch.setattr(store, "ship", ship)
+    monkeypatch.setattr(storing, "ship", ship)
     file = tmp_path / "file"
     file.touch()
     with pytest.raises(RunError, match=rf"{file} cannot be written: File exists\. Give another --into"):
