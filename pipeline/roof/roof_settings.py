@@ -248,7 +248,7 @@ class ArrangementSettings(Parameters):
         0.7, "How far a corner of three or more borders moves to join another.", unit="m", minimum=0.0, maximum=5.0
     )
     plane_shift_m: float = parameter(
-        0.1,
+        0.15,
         "How far a plane may move to meet its neighbours in their corners, root mean square over its points.",
         unit="m",
         minimum=0.0,
