@@ -12,13 +12,11 @@ import dataclasses
 import numpy as np
 
 from pipeline.model import BoolArray, ByteArray, IntArray, KindArray, LabelArray
-from pipeline.terrain.facets import SceneVertices, VertexKind
+from pipeline.terrain.facets import OnRoof, SceneVertices, VertexKind
 from pipeline.terrain.glass import glass_of
-from pipeline.terrain.ground import Terrain, ground_of, ground_points
-from pipeline.terrain.incomplete_classes import OnRoof, undecided_on_roofs
+from pipeline.terrain.ground import Terrain, ground_points
 from pipeline.terrain.lattice import CELL_MM, NO_DATA, height_above
 from pipeline.terrain.needed_ground import needed_vertices
-from pipeline.terrain.outliers import dense_enough
 from pipeline.terrain.point_assignment import Allowed, ScenePoints
 from pipeline.terrain.surfaces import Fragments, fragments_of
 from pipeline.terrain.terrain_settings import ClassCodeSettings, ClassesInUse, SceneSettings
@@ -90,21 +88,6 @@ def usable_as_ground(points: WindowPoints, kept: BoolArray, classes: ClassesInUs
     if classes.roofs:
         usable &= points.classification != BUILDING_CLASS
     return usable
-
-
-def terrain_of(
-    points: WindowPoints, window: Window, settings: SceneSettings, classes: ClassesInUse
-) -> tuple[Terrain, BoolArray]:
-    """Terrain of a window, and the mask of points that are not outliers.
-
-    A run does the same in stages: outliers by tile, the ground by larger blocks.
-    """
-    kept = dense_enough(points.x_mm, points.y_mm, points.z_mm, settings.outliers)
-    usable = usable_as_ground(points, kept, classes)
-    window_cells = lattice_of(window)
-    trusted = classes.ground
-    terrain = ground_of(points.x_mm, points.y_mm, points.z_mm, usable, window_cells, settings.ground, trusted=trusted)
-    return terrain, kept
 
 
 def _is_last(points: WindowPoints) -> BoolArray:
@@ -186,6 +169,10 @@ def _on_roofs(
     """`OnRoof` of the inner vertices (v,) of which neither class nor height says what they are."""
     undecided, building = kind == VertexKind.OBJECT, kind == VertexKind.BUILDING
     wanted = undecided & inner
+    if not building.any() or not wanted.any():
+        return np.full(len(kind), OnRoof.NO, np.int8)
+    from pipeline.terrain.incomplete_classes import undecided_on_roofs  # most files have no class 6 with gaps
+
     reach_m = settings.surfaces.reach_m
     return undecided_on_roofs(places_mm, building, undecided | building, wanted, settings.vegetation, reach_m)
 

@@ -37,7 +37,7 @@ def blocks(building: Building, plan: RoofPlan | None) -> Iterator[NamedForm[Draw
         outlines.append(("the points' hull", MultiPolygon([shapely.transform(hull, lambda xy: np.rint(xy * 1e3))])))
     tolerance_m, least_m2 = settings.simplification_spacings * roof.spacing_m, settings.min_part_area_m2
     for words, footprint in outlines:
-        for form in block_forms(footprint, plane, ground_z_m, tolerance_m, least_m2):
+        for form in block_forms(footprint, plane, ground_z_m, tolerance_m, least_m2, roof.limit_mm):
             yield NamedForm(BLOCK, partial(block_model, form, plane), f"on {words}")
 
 

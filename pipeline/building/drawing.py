@@ -6,8 +6,6 @@ import dataclasses
 import math
 
 import numpy as np
-import shapely
-from shapely import MultiPolygon
 
 from pipeline.methods import ReconstructSettings
 from pipeline.model import Candidate, Decision, Doubt, Plane, RoofType, Segmentation
@@ -23,8 +21,6 @@ from pipeline.roof.unsupported_faces import cut_at_floor, goes_far, level_unsupp
 
 _MUCH_LEVELLED = 0.05
 """Share of the plan. Where faces of more than this had to be made level, other forms are drawn and compared with it."""
-_STEPS_MM = np.array(sorted(((x, y) for x in range(-2, 3) for y in range(-2, 3)), key=lambda xy: (math.hypot(*xy), xy)))
-"""Places around one on the grid, the nearest first."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -68,13 +64,11 @@ def own_model(building: Building, segmentation: Segmentation, roof: RoofPoints, 
         drawn, roof = drawn.partition, dataclasses.replace(roof, labels=drawn.labels)
     elif drawn.planes is not None:
         planes = drawn.planes
-    if roof.outline_mm is not None:
-        drawn = _inside(drawn, roof.outline_mm)
     if segmentation.faces is not None:  # a primitive is one form: with a side made level it would be another
-        parts = large_parts(solid_parts(drawn, list(planes), ground_z_m), settings.min_part_area_m2)
+        parts = large_parts(solid_parts(drawn, list(planes), ground_z_m, roof.limit_mm), settings.min_part_area_m2)
         return DrawnModel(
             lod="2.2",
-            parts=[extra("unite_flush_walls")(part) for part in parts],
+            parts=[extra("unite_flush_walls")(part, roof.limit_mm) for part in parts],
             planes=list(planes),
             roof_type=segmentation.roof_type,
             bic_margin=margin,
@@ -87,7 +81,7 @@ def own_model(building: Building, segmentation: Segmentation, roof: RoofPoints, 
         if (roof.index < 0).any():  # points were added on unseen sides
             cut_planes = extra("with_support_of_seen")(cut, cut_planes, roof)
         contradiction = contradiction_of(cut, cut_planes, roof, slopes, segmentation.planes)
-        all_parts = solid_parts(cut, cut_planes, ground_z_m)
+        all_parts = solid_parts(cut, cut_planes, ground_z_m, roof.limit_mm)
         parts = large_parts(all_parts, settings.min_part_area_m2)
         levelled_share = levelled_share_of(level, len(planes))
         return DrawnModel(
@@ -108,22 +102,6 @@ def own_model(building: Building, segmentation: Segmentation, roof: RoofPoints, 
         whole = over(*level_unsupported_faces(drawn, roof, planes, ground_z_m, settings, ends=False))
         model = whole if _is_sound(whole) else model
     return model
-
-
-def _inside(drawn: RoofPartition, outline_mm: MultiPolygon) -> RoofPartition:
-    """Roof faces whose vertices lie in an outline that others touch, where rounding put some a millimetre outside."""
-    xy = np.unique(np.concatenate([shapely.get_coordinates(polygon) for polygon in drawn.polygons]), axis=0)
-    shapely.prepare(outline_mm)
-    outside = xy[~shapely.intersects_xy(outline_mm, xy[:, 0], xy[:, 1])]
-    near = outside[:, None] + _STEPS_MM
-    fits = shapely.intersects_xy(outline_mm, near[..., 0], near[..., 1])
-    moved = {tuple(xy): to[is_in][0] for xy, to, is_in in zip(outside.tolist(), near, fits, strict=True) if is_in.any()}
-    if not moved:
-        return drawn
-    polygons = shapely.transform(
-        list(drawn.polygons), lambda old: np.array([moved.get(tuple(xy), xy) for xy in old.tolist()])
-    )
-    return dataclasses.replace(drawn, polygons=tuple(polygons)) if shapely.is_valid(polygons).all() else drawn
 
 
 def _is_sound(model: DrawnModel) -> bool:

@@ -110,7 +110,7 @@ def delivered(building: Building, model: DrawnModel) -> BuildingResult | None:
         return record_of(building, model)
     models = extra("lower_lods")(
         model, building.roof.points, building.candidate.ground_z_m, settings.roof, lods,
-        lambda solid: not check_solid(solid),
+        lambda solid: not check_solid(solid), building.roof.limit_mm,
     )  # fmt: skip
     building.decisions.extend(_levels(lods, models))
     if not models or models[0].lod != lods[-1]:

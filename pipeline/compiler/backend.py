@@ -1,9 +1,10 @@
-"""How numba compiles our kernels: the only module that uses numba's internals.
+"""How numba loads our kernels: this module and `compilation` alone use numba's internals.
 
 A kernel that only other kernels call needs no machine code of its own: its callers link its code and optimise it
 together with theirs. numba nevertheless makes machine code and wrappers for each kernel, and for its own helpers
 (`np.argsort` and the like). Here code is optimised and generated only for kernels that Python calls. Compiled kernels
-are stored in our own files (`pipeline.compiler.store`) under fingerprints that cover their callees.
+are stored in our own files (`pipeline.compiler.store`) under fingerprints that cover their callees. What compiles them
+(`pipeline.compiler.compilation`) is loaded for the first one that no file has.
 
 The module is written for the versions in `KNOWN`. With any other numba, or with `GABLEWORK_PLAIN_NUMBA` set, kernels
 are plain `numba.njit(cache=True)`, whose files carry the same fingerprints: slower to compile, with equal results.
@@ -12,27 +13,24 @@ are plain `numba.njit(cache=True)`, whose files carry the same fingerprints: slo
 from __future__ import annotations
 
 import ctypes
-import functools
 import hashlib
 import io
 import os
 import pickle
 import threading
-import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
 import llvmlite.binding as llvm
 import numba
-from numba.core import cgutils, codegen, compiler, config, event, registry, serialize, sigutils
+from numba.core import codegen, compiler, config, registry, sigutils
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.environment import Environment, _rebuild_env
-from numba.core.runtime import _nrt_python, rtsys
-from numba.core.targetconfig import ConfigStack
-from numba.core.typing import templates
+from numba.core.runtime import _nrt_python
 
 from pipeline.compiler import store
 from pipeline.compiler.store import PORTABLE, Stored, processor
+from pipeline.registry import loaded
 
 types: Any = numba.types
 KNOWN = ("0.68.",)
@@ -52,17 +50,6 @@ def is_known() -> bool:
     return numba.__version__.startswith(KNOWN) and not os.environ.get(_PLAIN)
 
 
-@functools.cache
-def _warn_unknown() -> None:
-    """Warn once that everything is slower to compile."""
-    warnings.warn(
-        f"gablework does not know numba {numba.__version__} (it knows {', '.join(KNOWN)}x): kernels are compiled in "
-        "numba's own way, which takes three times as long, and none that were compiled ahead are loaded",
-        RuntimeWarning,
-        stacklevel=3,
-    )
-
-
 def dispatcher_of(
     function: Callable[..., Any], options: Mapping[str, Any], prefix: str, fingerprint: Callable[[], bytes]
 ) -> Any:
@@ -80,12 +67,9 @@ def dispatcher_of(
     if config.DISABLE_JIT:
         return function
     if not is_known():
-        if not os.environ.get(_PLAIN):
-            _warn_unknown()
-        made = numba.njit(cache=True, nogil=True, **options)(function)
-        # instead of a stamp of the kernel's own file: an edited callee counts, too
-        made._cache._cache_file._source_stamp = fingerprint().hex()
-        return made
+        from pipeline.compiler.plain_numba import plain_dispatcher
+
+        return plain_dispatcher(function, options, fingerprint, () if os.environ.get(_PLAIN) else KNOWN)
     _prepare()
     return KernelDispatcher(function, {**COMMON_OPTIONS, **options}, prefix, fingerprint)
 
@@ -99,55 +83,16 @@ def _prepare() -> None:
     if getattr(context, "gablework", False):
         return
     context.gablework = True
-    context.codegen()._library_class = _Library
-    make_executable = context.get_executable
-
-    def get_executable(library: Any, fndesc: Any, environment: Any) -> Any:
-        """The C function of a kernel; `_no_code` for one without a wrapper."""
-        flags = ConfigStack.top_or_none()
-        if flags is not None and flags.no_cpython_wrapper:
-            return _no_code()
-        made = make_executable(library, fndesc, environment)
-        _set_environments(library, *_environments(library))
-        return made
-
-    dynamic_address = context.add_dynamic_addr
-
-    def add_dynamic_addr(builder: Any, address: int, info: str) -> Any:
-        """Put an address of this process into the code, which then cannot be stored; null for a called kernel."""
-        if info == "Kernel":
-            return cgutils.voidptr_t(None)
-        return dynamic_address(builder, address, info)
-
-    build = templates._OverloadFunctionTemplate._get_impl
-
-    def get_implementation(template: Any, args: Any, kws: Any) -> Any:
-        """Find a helper of numba: the same one for callers with and without a wrapper."""
-        flags = ConfigStack.top_or_none()
-        if flags is None or flags.no_cpython_wrapper:
-            return build(template, args, kws)
-        plain = flags.copy()
-        plain.no_cpython_wrapper = True
-        with ConfigStack().enter(plain):
-            return build(template, args, kws)
-
-    templates._OverloadFunctionTemplate._get_impl = get_implementation
-    context.get_executable = get_executable
-    context.add_dynamic_addr = add_dynamic_addr
-    context.create_cfunc_wrapper = _no_wrapper
+    context.codegen()._library_class = Library
     for name, address in _nrt_python.c_helpers.items():
         llvm.add_symbol(name if name.startswith("_") else f"NRT_{name}", address)
-
-
-def _no_wrapper(*of_function: Any) -> None:
-    """Make no wrapper for C, which calls no kernel."""
 
 
 _NOTHING = Environment({})
 """Used for every empty environment."""
 
 
-def _no_code() -> Any:
+def no_code() -> Any:
     """A placeholder where numba wants a C function, new each time, since numba identifies functions by it.
 
     Calling it raises: it takes no arguments and the dictionary is empty.
@@ -155,19 +100,7 @@ def _no_code() -> Any:
     return {}.popitem
 
 
-def _environments(library: Any) -> tuple[tuple[Any, ...], tuple[str, ...]]:
-    """The environments that a library's code refers to: those with constants, and the names of the others.
-
-    An environment refers to its module, which loading imports; numba's own modules take a tenth of a second. Most
-    environments are empty, and one empty environment serves for all.
-    """
-    names = [v.name for v in library._final_module.global_variables if v.name.startswith(_ENVIRONMENTS)]
-    found = {name: compiler.lookup_environment(name) for name in names}
-    full = {name: one for name, one in found.items() if one is not None and one.consts}
-    return tuple(full.values()), tuple(name for name in names if name not in full)
-
-
-def _set_environments(library: Any, full: Iterable[Any], empty: Iterable[str]) -> None:
+def set_environments(library: Any, full: Iterable[Any], empty: Iterable[str]) -> None:
     """Point a library's loaded code to its environments.
 
     All code of a process shares one pointer per name. A kernel called by kernels has no constants; made callable from
@@ -203,7 +136,7 @@ class _FactsReader(pickle.Unpickler):
         return super().find_class(module, name)
 
 
-class _Library(codegen.JITCodeLibrary):
+class Library(codegen.JITCodeLibrary):
     """Code that is only linked until its address is needed."""
 
     _has_code = False
@@ -263,19 +196,7 @@ class _Depth(threading.local):
     value = 0
 
 
-_DEPTH = _Depth()
-
-
-def _without_wrappers(flags: Any) -> Any:
-    """Numba's flags for a kernel: only one that Python calls gets a wrapper."""
-    flags.no_cpython_wrapper = _DEPTH.value > 1
-    return flags
-
-
-def _common(kind: Any) -> Any:
-    """The common type of similar ones: int64 for signed integers, no literals."""
-    kind = types.unliteral(kind)
-    return types.int64 if isinstance(kind, types.Integer) and kind.signed else kind
+DEPTH = _Depth()
 
 
 def _fields_in(kinds: Iterable[Any]) -> Iterator[tuple[str, str, tuple[str, ...]]]:
@@ -295,9 +216,8 @@ class KernelDispatcher(registry.CPUDispatcher):
         self, function: Callable[..., Any], options: Mapping[str, Any], prefix: str, fingerprint: Callable[[], bytes]
     ) -> None:
         super().__init__(function, targetoptions=dict(options))
-        self._prefix = prefix
-        self._compiler._customize_flags = _without_wrappers
-        self._fingerprint = fingerprint
+        self.prefix = prefix
+        self.fingerprint = fingerprint
         self._callable: set[tuple[Any, ...]] = set()
 
     def _compilation_chain_init_hook(self) -> None:
@@ -305,21 +225,20 @@ class KernelDispatcher(registry.CPUDispatcher):
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
         """How another kernel calls this one: with one type per kind of number, so it is compiled once."""
-        return super().get_call_template(tuple(map(_common, args)), {name: _common(kind) for name, kind in kws.items()})
+        common = loaded("pipeline.compiler.compilation:common_type")
+        return super().get_call_template(tuple(map(common, args)), {name: common(kind) for name, kind in kws.items()})
 
     def compile(self, sig: Any) -> Any:
         """Load or compile the kernel for a signature; returns its C function if Python calls it."""
         arguments, _ = sigutils.normalize_signature(sig)
         with global_compiler_lock, self._compiling_counter:
-            for_python = _DEPTH.value == 0
+            for_python = DEPTH.value == 0
             if arguments in self.overloads and (arguments in self._callable or not for_python):
                 return self.overloads[arguments].entry_point
-            name = self._prefix + self._suffix(arguments)
-            if not self._load(name, arguments, for_python=for_python):
-                with store.claimed(name):
-                    # another process may have compiled it in the meantime
-                    if not self._load(name, arguments, for_python=for_python):
-                        self._compile(name, arguments, for_python=for_python)
+            name = self.prefix + self._suffix(arguments)
+            if not self.load(name, arguments, for_python=for_python):
+                compile_kernel = loaded("pipeline.compiler.compilation:compile_kernel")
+                compile_kernel(self, name, arguments, for_python=for_python)
             return self.overloads[arguments].entry_point
 
     @staticmethod
@@ -329,12 +248,12 @@ class KernelDispatcher(registry.CPUDispatcher):
         facts = repr((str(arguments), [*_fields_in(arguments)], processor))
         return hashlib.sha256(facts.encode()).hexdigest()[:16]
 
-    def _load(self, name: str, arguments: tuple[Any, ...], *, for_python: bool) -> bool:
+    def load(self, name: str, arguments: tuple[Any, ...], *, for_python: bool) -> bool:
         """Load the kernel if a suitable file of it exists.
 
         For another kernel only its bitcode: while that one is compiled, numba makes no function that Python can call.
         """
-        stored = store.load(name, self._fingerprint(), runnable=for_python)
+        stored = store.load(name, self.fingerprint(), runnable=for_python)
         if stored is None:
             return False
         facts = _FactsReader(io.BytesIO(stored.facts)).load()
@@ -345,10 +264,10 @@ class KernelDispatcher(registry.CPUDispatcher):
             self.targetctx.refresh()
         library = self.targetctx.codegen().create_library(fndesc.qualname)
         library.load(stored, defined, runnable=for_python)
-        entry = self.targetctx.get_executable(library, fndesc, environment) if for_python else _no_code()
+        entry = self.targetctx.get_executable(library, fndesc, environment) if for_python else no_code()
         if for_python:
-            _set_environments(library, *environments)
-        self._take(
+            set_environments(library, *environments)
+        self.take(
             arguments,
             compiler.compile_result(
                 typing_context=self.typingctx,
@@ -368,61 +287,8 @@ class KernelDispatcher(registry.CPUDispatcher):
         self.targetctx.insert_user_function(entry, fndesc, [library])
         return True
 
-    def _compile(self, name: str, arguments: tuple[Any, ...], *, for_python: bool) -> None:
-        """Compile the kernel and store it."""
-        known = self.overloads.get(arguments)
-        if known is not None:
-            result = self._with_wrapper(known)
-        else:
-            from pipeline.compiler.frame_room import with_room_for_frames
-
-            store.warn_of_misfits(self._prefix)
-            compiling = functools.partial(self._compiled, arguments)
-            result = compiling() if _DEPTH.value else with_room_for_frames(compiling)
-        self._take(arguments, result, runnable=for_python)
-        library, fndesc = result.library, result.fndesc
-        library._ensure_finalized()
-        environments = _environments(library)
-        if library.has_dynamic_globals or not all(one.can_cache() for one in environments[0]):
-            return
-        bitcode = library._get_module_for_linking().as_bitcode()
-        fndesc.typemap = fndesc.calltypes = None
-        facts = (
-            fndesc,
-            result.environment,
-            result.signature,
-            result.reload_init,
-            environments,
-            (fndesc.llvm_func_name, fndesc.llvm_cpython_wrapper_name),
-        )
-        code = library._get_compiled_object() if for_python else b""
-        store.save(name, self._fingerprint(), Stored(facts=serialize.dumps(facts), machine_code=code, bitcode=bitcode))
-
-    def _compiled(self, arguments: tuple[Any, ...]) -> Any:
-        """Numba's result for the kernel; compiles its callees, too."""
-        _DEPTH.value += 1
-        try:
-            details = {"dispatcher": self, "args": arguments, "return_type": None}
-            with event.trigger_event("numba:compile", data=details):
-                return self._compiler.compile(arguments, None)
-        finally:
-            _DEPTH.value -= 1
-
-    def _with_wrapper(self, known: Any) -> Any:
-        """Make a kernel that only kernels called so far callable from Python."""
-        context = self.targetctx.subtarget(environment=known.environment, fndesc=known.fndesc, enable_nrt=True)
-        library = context.codegen().create_library(known.fndesc.qualname)
-        library.enable_object_caching()
-        context.create_cpython_wrapper(library, known.fndesc, known.environment, None, release_gil=True)
-        library.add_linking_library(known.library)
-        # the wrapper releases arrays: without the code for that it runs only where something else brought it
-        library.add_linking_library(rtsys.library)
-        entry = context.get_executable(library, known.fndesc, known.environment)
-        # numba finds a compiled function by its C function, which has changed
-        self.targetctx.insert_user_function(entry, known.fndesc, [library])
-        return known._replace(library=library, entry_point=entry)
-
-    def _take(self, arguments: tuple[Any, ...], result: Any, *, runnable: bool) -> None:
+    def take(self, arguments: tuple[Any, ...], result: Any, *, runnable: bool) -> None:
+        """Know a kernel for a signature from now on."""
         self.overloads[arguments] = result
         if runnable:
             self._callable.add(arguments)

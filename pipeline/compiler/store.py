@@ -9,17 +9,13 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import fcntl
 import functools
 import glob
 import hashlib
 import json
 import os
 import struct
-import sys
 import warnings
-import zlib
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 ENDING = ".kernel"
@@ -28,8 +24,6 @@ LIST = "kernels.json"
 """File beside the kernels of a package or an image: the sha256 of each, by file name."""
 _HEADER = struct.Struct("<8s32sQQQ")
 _MAGIC = b"gwkern03"
-_LOCKS = "locks"
-_LOCK_RANGE = 2**30
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -75,52 +69,19 @@ def load(name: str, fingerprint: bytes, *, runnable: bool) -> Stored | None:
     A `runnable` one has machine code, which a kernel lacks if only kernels have called it.
     """
     file_name = name + ENDING
-    listed = _shipped_hashes().get(file_name)
+    listed = shipped_hashes().get(file_name)
     for folder in (shipped_folder(), folder_of_kernels()) if listed else (folder_of_kernels(),):
         try:
             content = (folder / file_name).read_bytes()
         except OSError:
             continue
         if folder == shipped_folder() and hashlib.sha256(content).hexdigest() != listed:
-            _warn(f"{folder / file_name} is not the file that {LIST} lists: this kernel is compiled again")
+            warn(f"{folder / file_name} is not the file that {LIST} lists: this kernel is compiled again")
             continue
         stored = Stored.from_bytes(content, fingerprint)
         if stored is not None and (stored.machine_code or not runnable):
             return stored
     return None
-
-
-def warn_of_misfits(name: str) -> None:
-    """Warn once if the package has compiled kernels and this one has to be compiled nevertheless."""
-    if _shipped_hashes():
-        _warn(
-            f"kernels are compiled, {name} first: those in {shipped_folder()} were made for another Python, numba or "
-            "processor, or are called in a new way",
-            once="misfit",
-        )
-
-
-def save(name: str, fingerprint: bytes, stored: Stored) -> None:
-    """Store a compiled kernel for later processes; if nothing can be written, warn once and continue."""
-    folder = folder_of_kernels()
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        part = folder / f".{name}.{os.getpid()}.part"
-        try:
-            part.write_bytes(stored.to_bytes(fingerprint))
-            part.replace(folder / (name + ENDING))
-        finally:
-            part.unlink(missing_ok=True)
-    except OSError as error:
-        fault = f"compiled kernels cannot be stored in {folder}: {error.strerror}. Set NUMBA_CACHE_DIR to a folder"
-        _warn(fault, once="cannot be stored")
-
-
-def can_save() -> bool:
-    """Whether compiled kernels can be stored; makes their folder."""
-    with contextlib.suppress(OSError):
-        folder_of_kernels().mkdir(parents=True, exist_ok=True)
-    return os.access(folder_of_kernels(), os.W_OK)
 
 
 def is_stored(prefix: str, fingerprint: bytes) -> bool:
@@ -132,44 +93,6 @@ def is_stored(prefix: str, fingerprint: bytes) -> bool:
                 if len(head) == _HEADER.size and _HEADER.unpack(head)[:2] == (_MAGIC, fingerprint):
                     return True
     return False
-
-
-@contextlib.contextmanager
-def claimed(name: str) -> Iterator[None]:
-    """Lock a kernel while it is compiled: another process that needs it waits and then finds it compiled.
-
-    If files cannot be locked, both compile it, which costs time and does no harm.
-    """
-    file = _lock_file()
-    if file is None:
-        yield
-        return
-    at = zlib.crc32(name.encode()) % _LOCK_RANGE
-    # some file systems have no locks; and if two kernels share a byte, the system reports the deadlock of two processes
-    with contextlib.suppress(OSError):
-        fcntl.lockf(file, fcntl.LOCK_EX, 1, at)
-    try:
-        yield
-    finally:
-        with contextlib.suppress(OSError):
-            fcntl.lockf(file, fcntl.LOCK_UN, 1, at)
-
-
-def ship(folder: Path, is_current: Callable[[str, bytes], bool]) -> int:
-    """Copy the compiled kernels to a folder for a package, with a list of their hashes; returns the number of files.
-
-    The folder is new or empty. `is_current` says whether a kernel, `module.function`, has a fingerprint; files of
-    earlier versions are left out.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    hashes = {}
-    for path in sorted(folder_of_kernels().glob(f"*{ENDING}")):
-        content = path.read_bytes()
-        if is_current(path.name.partition(f".{sys.implementation.cache_tag}-")[0], Stored.fingerprint_of(content)):
-            (folder / path.name).write_bytes(content)
-            hashes[path.name] = hashlib.sha256(content).hexdigest()
-    (folder / LIST).write_text(json.dumps(hashes, indent=0) + "\n", encoding="ascii")
-    return len(hashes)
 
 
 @functools.cache
@@ -193,7 +116,7 @@ def folder_of_kernels() -> Path:
 
 
 @functools.cache
-def _shipped_hashes() -> dict[str, str]:
+def shipped_hashes() -> dict[str, str]:
     """The hashes of the package's files, by name."""
     try:
         hashes: dict[str, str] = json.loads((shipped_folder() / LIST).read_text(encoding="ascii"))
@@ -202,23 +125,10 @@ def _shipped_hashes() -> dict[str, str]:
     return hashes
 
 
-@functools.cache
-def _lock_file() -> int | None:
-    """The file whose bytes are locked, opened once: closing any descriptor of it would release all locks."""
-    try:
-        folder_of_kernels().mkdir(parents=True, exist_ok=True)
-        return os.open(folder_of_kernels() / _LOCKS, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
-    except OSError:
-        return None
-
-
-# locks belong to a process: a forked one opens the file itself, as its copy of the descriptor may be closed
-os.register_at_fork(after_in_child=_lock_file.cache_clear)
-
 _warned: set[str] = set()
 
 
-def _warn(text: str, *, once: str = "") -> None:
+def warn(text: str, *, once: str = "") -> None:
     """Warn once about each thing."""
     if (once or text) not in _warned:
         _warned.add(once or text)

@@ -1,8 +1,8 @@
 """Kernels compiled ahead of their first call, in several processes.
 
 `kernels.json` lists the kernels and signatures that Python calls, grouped by command; their callees are compiled with
-them. A process waits for a kernel that another one is compiling (`store.claimed`), so none is compiled twice. A kernel
-that the list lacks is compiled at its first call.
+them. A process waits for a kernel that another one is compiling (`storing.claimed`), so none is compiled twice. A
+kernel that the list lacks is compiled at its first call.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
-from pipeline.compiler import store
+from pipeline.compiler import store, storing
 from pipeline.compiler.kernel import Kernel, is_off, kernel_named
 from pipeline.errors import RunError
 
@@ -124,7 +124,7 @@ def ship(folder: Path) -> int:
         return isinstance(kernel, Kernel) and kernel.fingerprint == fingerprint
 
     try:
-        shipped = store.ship(folder, is_current)
+        shipped = storing.ship(folder, is_current)
     except OSError as error:
         raise RunError(f"{folder} cannot be written: {error.strerror or error}. Give another --into") from error
     if not shipped:

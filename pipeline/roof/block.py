@@ -38,18 +38,23 @@ def block_plane(points: FloatArray, ground_z_m: float, percentile: float) -> Pla
 
 
 def block_forms(
-    footprint_mm: MultiPolygon, plane: Plane, ground_z_m: float, tolerance_m: float, min_area_m2: float
+    footprint_mm: MultiPolygon,
+    plane: Plane,
+    ground_z_m: float,
+    tolerance_m: float,
+    min_area_m2: float,
+    outline_mm: MultiPolygon | None = None,
 ) -> Iterator[Callable[[], list[SolidPart]]]:
     """Ways to draw one block for every part of a footprint, the nearest to it first, with a horizontal plane.
 
     First on the footprint itself, in valid integer millimetres; then opened by a few centimetres where it pinches,
     drawn back until parts and holes do not touch, more and more simplified, up to `tolerance_m`; at last on its convex
-    hull. Parts below `min_area_m2` are left out if a larger one exists.
+    hull. Parts below `min_area_m2` are left out if a larger one exists. An outline that others touch cuts all of them.
 
     Each way draws the blocks, at least one and not yet judged. It raises BuildingError where they cannot be drawn:
     `no_footprint` where no part has an area, `no_partition` where parts overlap or touch; or what GEOS raises.
     """
-    build = partial(_blocks, plane=plane, ground_z_m=ground_z_m, min_area_m2=min_area_m2)
+    build = partial(_blocks, plane=plane, ground_z_m=ground_z_m, min_area_m2=min_area_m2, outline_mm=outline_mm)
     yield partial(build, footprint_mm)
     for share in _SHARES_OF_TOLERANCE if tolerance_m > 0.0 else (0.0,):
         for back_mm in _DRAWN_BACK_MM:
@@ -70,14 +75,20 @@ def _drawn_back(
 
 
 def _blocks(
-    shape: BaseGeometry, *, plane: Plane, ground_z_m: float, min_area_m2: float, tolerance_mm: float = 0.0
+    shape: BaseGeometry,
+    *,
+    plane: Plane,
+    ground_z_m: float,
+    min_area_m2: float,
+    outline_mm: MultiPolygon | None,
+    tolerance_mm: float = 0.0,
 ) -> list[SolidPart]:
     """Extrude the large parts of a shape, simplified."""
     polygons = _clean_parts(shape, tolerance_mm, min_area_m2)
     if not polygons:
         raise BuildingError(Reason.NO_FOOTPRINT, f"the outline has an area of {shape.area * 1e-6:g} m2")
     partition = RoofPartition(polygons=tuple(polygons), labels=np.zeros(len(polygons), np.int32))
-    return solid_parts(partition, [plane], ground_z_m)
+    return solid_parts(partition, [plane], ground_z_m, outline_mm)
 
 
 def _clean_parts(shape: BaseGeometry, tolerance_mm: float, min_area_m2: float) -> list[Polygon]:

@@ -2,23 +2,27 @@
 
 Outlines drawn one by one end about half a point spacing outside of the outermost points, so those of two sheds that
 touch cross. The division of an overlap follows from the two outlines and their points alone, so two tasks decide alike,
-whatever the order and the tiles. A third outline changes nothing between the two. Everything is done in integer
-millimetres of the CRS. A border between two outlines has the same corners on both sides, except beside a third one.
+whatever the order and the tiles. A third outline changes nothing between the two: each keeps what it keeps beside all
+others, and places where such parts cross are rounded inward. Everything is done in integer millimetres of the CRS. A
+border between two outlines has the same corners on both sides, except beside a third one.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
-from collections.abc import Iterable, Iterator, Sequence
-from collections.abc import Set as AbstractSet
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 import shapely
 from shapely import MultiPolygon, Polygon
 
+from pipeline.errors import BuildingError
 from pipeline.model import FloatArray, IntArray
 from pipeline.roof.footprint import polygons_of
+from pipeline.roof.partition import RoofPartition
+from pipeline.roof.within_outline import within_outline
 
 # None of these is a setting: they choose between ways to divide an area that is narrower than a few point spacings.
 _SMALL_MM2 = 2e4
@@ -43,8 +47,6 @@ _NEEDLE_MM = 120.0
 """Half the width of a part that is not left of an outline: no wing of a house is as narrow."""
 _SHORTEST_MM = 20.0
 """Corners nearer to each other are united when a solid is made, which would move a common border."""
-_ROUNDING_MM = 1.5
-"""Corners that rounding adds lie within this of a straight edge."""
 _MITRE = 6.0
 """Offset corners sharper than 20 degrees are cut."""
 
@@ -66,23 +68,36 @@ class Claim:
         return -float(np.median(self.points_mm[:, 2])) if len(self.points_mm) else 0.0, self.name
 
 
-def divided(first: Claim, second: Claim) -> tuple[list[Polygon], list[Polygon]]:
-    """The parts of the overlap of two outlines that the first keeps, and those that the second keeps.
+def divided(first: Claim, second: Claim) -> tuple[MultiPolygon, MultiPolygon]:
+    """What either of two outlines keeps beside the other: parts of one drawing, which do not overlap.
 
-    Both are in integer millimetres and do not overlap. The result is the same, swapped, for swapped arguments.
+    Both are in integer millimetres. The result is the same, swapped, for swapped arguments.
     """
     if second.rank < first.rank:
         lower, upper = divided(second, first)
         return upper, lower
-    kept: tuple[list[Polygon], list[Polygon]] = ([], [])
-    pieces = polygons_of(shapely.intersection(first.outline_mm, second.outline_mm, grid_size=1.0))
-    for piece in pieces:
-        if piece.area < _SMALL_MM2:
-            kept[0].append(piece)
-            continue
-        for side, part in zip(kept, _shares(piece, first, second), strict=True):
-            side.extend(part)
-    return kept
+    to_first: list[Polygon] = []
+    to_second: list[Polygon] = []
+    for piece in polygons_of(shapely.intersection(first.outline_mm, second.outline_mm, grid_size=1.0)):
+        mine, theirs = ([piece], []) if piece.area < _SMALL_MM2 else _shares(piece, first, second)
+        to_first += mine
+        to_second += theirs
+    drawn = [first.outline_mm, second.outline_mm, *to_first, *to_second]
+    net = shapely.union_all(shapely.boundary(drawn), grid_size=1.0)
+    cells = np.array(polygons_of(shapely.polygonize(shapely.get_parts(net))), dtype=object)
+    places = shapely.point_on_surface(cells)
+    is_first = shapely.intersects(first.outline_mm, places)
+    is_second = shapely.intersects(second.outline_mm, places)
+    is_first &= ~shapely.intersects(shapely.union_all(to_second), places)
+    is_second &= ~(is_first | shapely.intersects(shapely.union_all(to_first), places))
+    kept, left = (_united(cells[chosen]) for chosen in (is_first, is_second))
+    return kept, left
+
+
+def _united(cells: np.ndarray[tuple[int], np.dtype[np.object_]]) -> MultiPolygon:
+    """Cells of one drawing as one shape."""
+    found: MultiPolygon = shapely.normalize(MultiPolygon(polygons_of(shapely.coverage_union_all(cells))))
+    return found
 
 
 def _shares(piece: Polygon, first: Claim, second: Claim) -> tuple[list[Polygon], list[Polygon]]:
@@ -94,16 +109,16 @@ def _shares(piece: Polygon, first: Claim, second: Claim) -> tuple[list[Polygon],
         options.extend(_chords(piece, own, other))
     options.extend((taken, none, wrong) for taken, wrong in _retreats(piece, second))
     options.extend((none, taken, wrong) for taken, wrong in _retreats(piece, first))
-    whole = [_effort(claim.outline_mm) for claim in (first, second)]
+    whole = [effort(claim.outline_mm) for claim in (first, second)]
     least, best = math.inf, (none, none)
     for mine, theirs, wrong in options:
         cost = _WRONG_COST * wrong
-        for claim, lost, effort in ((first, theirs, whole[0]), (second, mine, whole[1])):
+        for claim, lost, as_it_is in ((first, theirs, whole[0]), (second, mine, whole[1])):
             if not lost:
-                cost += effort
+                cost += as_it_is
             elif cost < least:
                 left = shapely.difference(claim.outline_mm, MultiPolygon(lost), grid_size=1.0)
-                cost += _effort(left) + (_BARRED if left.area < _KEPT_SHARE * claim.outline_mm.area else 0.0)
+                cost += effort(left) + (_BARRED if left.area < _KEPT_SHARE * claim.outline_mm.area else 0.0)
         if cost < least:
             least, best = cost, (mine, theirs)
     return best
@@ -161,7 +176,7 @@ def _chords(piece: Polygon, own: IntArray, other: IntArray) -> Iterator[tuple[li
         yield (near, far, wrong) if behind[best] > 0.5 * sign.sum() else (far, near, wrong)
 
 
-def _effort(area: shapely.Geometry) -> float:
+def effort(area: shapely.Geometry) -> float:
     """What it takes to describe an area: its corners; acute ones, short edges and parts cost more."""
     cost = 0.0
     for polygon in polygons_of(area):
@@ -176,33 +191,32 @@ def _effort(area: shapely.Geometry) -> float:
     return cost
 
 
-def left_of(
-    outline_mm: MultiPolygon, kept: Iterable[Polygon], lost: Sequence[Polygon], min_area_m2: float
-) -> MultiPolygon:
-    """An outline without the parts of its overlaps that it lost; those that it kept give it their corners.
+def left_of(outline_mm: MultiPolygon, kept: Iterable[MultiPolygon], min_area_m2: float) -> MultiPolygon:
+    """What is left of an outline by what it keeps beside each other one; within all of these, to the millimetre.
 
-    Needles are cut off, and parts below the least area left out, except the largest. Nothing is added, apart from the
-    rounding of common corners to 1 mm. An outline that others took whole is returned as it is.
+    Needles are cut off, and parts below the least area left out, except the largest. Empty where others took all.
     """
-    pieces = [*kept, *lost]
-    if not pieces:
-        return outline_mm
-    lines = shapely.boundary([outline_mm, *pieces])
-    cells = shapely.get_parts(shapely.polygonize([shapely.union_all(lines, grid_size=1.0)]))
-    places = shapely.point_on_surface(cells)
-    is_own = shapely.intersects(outline_mm, places)
-    if lost:
-        is_own &= ~shapely.intersects(shapely.union_all(lost), places)
-    own = polygons_of(shapely.coverage_union_all(cells[is_own]))
-    if lost:
-        own = [part for polygon in own for part in _without_needles(polygon)] or own
-    known = {(x, y) for x, y in shapely.get_coordinates([outline_mm, *pieces]).tolist()}
-    own = [_without_short_edges(_without_rounded(polygon, known)) for polygon in own]
-    large = [polygon for polygon in own if polygon.area >= min_area_m2 * 1e6]
-    if not own:
-        return outline_mm
+    # the order decides how crossings are rounded
+    limits = sorted({shape.wkb: shape for shape in kept}.items())
+    left = functools.reduce(shapely.intersection, (shape for _, shape in limits)) if limits else outline_mm
+    own = [_without_short_edges(part) for polygon in polygons_of(left) for part in _without_needles(polygon)]
+    within = [part for polygon in own for part in _on_grid_within(polygon, left)]
+    large = [polygon for polygon in within if polygon.area >= min_area_m2 * 1e6]
+    large = large or sorted(within, key=lambda polygon: (polygon.area, polygon.bounds))[-1:]
     # the order of the pieces decides where rings begin
-    return shapely.normalize(MultiPolygon(large or [max(own, key=lambda polygon: (polygon.area, polygon.bounds))]))
+    return shapely.normalize(MultiPolygon(large))
+
+
+def _on_grid_within(polygon: Polygon, limit: shapely.Geometry) -> list[Polygon]:
+    """A polygon with its vertices on the grid, within a limit; without what is too narrow for that."""
+    on_grid = polygons_of(shapely.set_precision(polygon, 1.0))
+    if not on_grid:
+        return []
+    faces = RoofPartition(polygons=tuple(on_grid), labels=np.zeros(len(on_grid), np.int32))
+    try:
+        return list(within_outline(faces, MultiPolygon(polygons_of(limit))).polygons)
+    except BuildingError:
+        return []
 
 
 def _without_needles(polygon: Polygon) -> list[Polygon]:
@@ -211,22 +225,6 @@ def _without_needles(polygon: Polygon) -> list[Polygon]:
     opened = shapely.buffer(inner, _NEEDLE_MM, join_style="mitre", mitre_limit=_MITRE)
     needles = [one for one in polygons_of(shapely.difference(polygon, opened)) if _is_needle(one)]
     return polygons_of(shapely.difference(polygon, MultiPolygon(needles), grid_size=1.0)) if needles else [polygon]
-
-
-def _without_rounded(polygon: Polygon, known: AbstractSet[tuple[float, float]]) -> Polygon:
-    """A polygon without corners that rounding added on straight edges: the other side has none there."""
-    rings = []
-    for ring in shapely.get_rings(polygon).tolist():
-        xy = shapely.get_coordinates(ring)[:-1]
-        before, after = np.roll(xy, 1, axis=0), np.roll(xy, -1, axis=0)
-        (ux, uy), (dx, dy) = (after - before).T, (xy - before).T
-        is_straight = np.abs(ux * dy - uy * dx) <= _ROUNDING_MM * np.hypot(ux, uy)
-        is_known = np.array([(x, y) in known for x, y in xy.tolist()])
-        rings.append(xy[is_known | ~is_straight])
-    if min(map(len, rings)) < 3:
-        return polygon
-    plain = Polygon(rings[0], rings[1:])
-    return plain if plain.is_valid else polygon
 
 
 def _is_needle(part: Polygon) -> bool:

@@ -7,8 +7,10 @@ import itertools
 import math
 from collections.abc import Sequence
 
+import numpy as np
+
 from pipeline.compiler import kernel
-from pipeline.model import FloatArray
+from pipeline.model import FloatArray, IntArray
 
 Point = tuple[float, float]
 
@@ -33,6 +35,8 @@ class Run:
     """From the first to the last vertex."""
     exact: bool = False
     """Whether the line, or its direction, is known otherwise than by the stretch."""
+    own: float = 0.0
+    """Direction of the stretch alone, where `fitted_runs` found it, radians."""
 
 
 def fitted_run(border: FloatArray, first: int, last: int) -> Run:
@@ -42,6 +46,21 @@ def fitted_run(border: FloatArray, first: int, last: int) -> Run:
     """
     x, y, direction, length = _fit(border, first, last)
     return Run(first=first, last=last, x=x, y=y, direction=direction, length=length)
+
+
+def fitted_runs(border: FloatArray, ends: IntArray) -> list[Run]:
+    """The lines through the stretches between each two vertices that follow one another, (e + 1,)."""
+    lines, pairs = _fits(border, ends).tolist(), itertools.pairwise(ends.tolist())
+    return [Run(first, last, *line, own=line[2]) for (first, last), line in zip(pairs, lines, strict=True)]
+
+
+@kernel
+def _fits(border: FloatArray, ends: IntArray) -> FloatArray:
+    """`_fit` of each stretch, (e, 4)."""
+    lines = np.empty((len(ends) - 1, 4))
+    for k in range(len(ends) - 1):
+        lines[k, 0], lines[k, 1], lines[k, 2], lines[k, 3] = _fit(border, ends[k], ends[k + 1])
+    return lines
 
 
 @kernel

@@ -73,6 +73,8 @@ class RoofPoints:
     """The given footprint in integer millimetres."""
     outline_mm: MultiPolygon | None = None
     """The outline that was drawn with regard to touching units and candidates; integer millimetres."""
+    limit_mm: MultiPolygon | None = None
+    """The same with vertices that hardly bend it, which others have, too: solids stay within it."""
     guides: tuple[Guide, ...] = ()
     """Given lines, local metres."""
     guide_distance_m: float = 0.0
@@ -113,6 +115,11 @@ def roof_points(cloud: PreparedCloud, settings: RoofSettings, decisions: list[De
         decisions.append(Decision.check("roof_points", len(index), fewest))
     if len(index) < fewest:
         raise BuildingError(Reason.TOO_FEW_POINTS, f"{len(index)} roof points, fewer than {name} = {fewest}")
+    limit_mm = None
+    if candidate.outline is not None and not candidate.guides:  # guides change it
+        from pipeline.roof.within_outline import limit_in_mm
+
+        limit_mm = limit_in_mm(candidate.outline)
     xy_mm = cloud.points_mm.take(index, axis=0)[:, :2] + (cloud.shift_m[:2] * 1e3).astype(np.int64)
     return RoofPoints(
         points=points,
@@ -122,6 +129,7 @@ def roof_points(cloud: PreparedCloud, settings: RoofSettings, decisions: list[De
         split=_are_among(xy_mm, candidate.split_returns),
         spacing_m=min(max(spacing_over_area_m(points), _MIN_SPACING_M), _MAX_SPACING_M),
         footprint_mm=_in_mm(candidate.footprint),
+        limit_mm=limit_mm,
         outline_mm=_in_mm(candidate.outline),
         facades=_facades(candidate, points) if settings.at_walls or settings.finds_walls else None,
     )
@@ -233,7 +241,7 @@ def _traced_plan(roof: RoofPoints, planes: Sequence[Plane], settings: RoofSettin
     if given is not None:
         return RoofPlan(planes=tuple(planes), faces=partition, outline_mm=given, raw=None)
     around = outline(partition)
-    if not settings.straight_eaves:
+    if not settings.straight_eaves and roof.outline_mm is None:
         return RoofPlan(planes=tuple(planes), faces=partition, outline_mm=around, raw=partition)
     faces = partition
     if continued:
@@ -265,7 +273,7 @@ def drawn_outline(roof: RoofPoints, settings: RoofSettings) -> MultiPolygon:
     if roof.footprint_mm is not None:
         _require_extent(float(np.ptp(shapely.get_coordinates(roof.footprint_mm), axis=0).max()) * 1e-3)
         return roof.footprint_mm
-    if roof.outline_mm is not None and settings.straight_eaves:
+    if roof.outline_mm is not None:
         return roof.outline_mm
     z = np.sort(roof.points[:, 2])
     level = Plane(a=0.0, b=0.0, c=float(z[len(z) // 2]), n_points=len(z), rmse_m=0.0)

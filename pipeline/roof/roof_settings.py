@@ -248,7 +248,7 @@ class ArrangementSettings(Parameters):
         0.7, "How far a corner of three or more borders moves to join another.", unit="m", minimum=0.0, maximum=5.0
     )
     plane_shift_m: float = parameter(
-        0.15,
+        0.1,
         "How far a plane may move to meet its neighbours in their corners, root mean square over its points.",
         unit="m",
         minimum=0.0,
@@ -256,7 +256,8 @@ class ArrangementSettings(Parameters):
     )
     min_face_width_m: float = parameter(
         0.5,
-        "A narrower sliver is not a roof face: gutters, the smeared edge of a wall. A parapet along the outline stays.",
+        "A narrower sliver is not a roof face: gutters, low rims, the smeared edge of a wall. A parapet on the outline "
+        "stays.",
         unit="m",
         minimum=0.0,
         maximum=2.0,

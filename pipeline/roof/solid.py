@@ -14,6 +14,7 @@ from itertools import pairwise
 
 import numpy as np
 import shapely
+from shapely import MultiPolygon
 
 from pipeline.errors import BuildingError
 from pipeline.geometry import corners_of_rings
@@ -46,13 +47,19 @@ class LodParts:
     """The planes that the labels of the parts' faces number."""
 
 
-def solid_parts(partition: RoofPartition, planes: Sequence[Plane], ground_z_m: float) -> list[SolidPart]:
+def solid_parts(
+    partition: RoofPartition, planes: Sequence[Plane], ground_z_m: float, outline_mm: MultiPolygon | None = None
+) -> list[SolidPart]:
     """Extrude a partition to one closed solid for every connected part, in the order of each part's first polygon.
 
     The partition is a valid coverage in integer millimetres; the planes that its labels number lie above the floor over
-    their polygons. Coordinates of solids are multiples of 1 mm. Raises BuildingError `no_partition` where borders
-    overlap, pinch, or a plane dips under the floor.
+    their polygons. Coordinates of solids are multiples of 1 mm. The solids stay within an outline that others touch, if
+    there is one. Raises BuildingError `no_partition` where borders overlap, pinch, or a plane dips under the floor.
     """
+    if outline_mm is not None:
+        from pipeline.roof.within_outline import within_outline
+
+        partition = within_outline(partition, outline_mm)
     xy, ring, polygon = corners_of_rings(shapely.orient_polygons(partition.polygons))
     coefficients = np.array([plane.coefficients for plane in planes]).reshape(len(planes), 3)
     solids, fault = extruded(xy, ring, polygon, partition.labels, coefficients, round(ground_z_m * 1e3))

@@ -95,7 +95,7 @@ def compile_first(
     kernels = missing_kernels(groups)
     if not kernels:
         return
-    from pipeline.compiler import store
+    from pipeline.compiler import store, storing
     from pipeline.compiler.backend import is_known  # loads numba
     from pipeline.compiler.warm_up import about_s, compile_kernels
     from pipeline.runtime.isolation.child_main import end_with_parent
@@ -103,7 +103,7 @@ def compile_first(
     if not is_known():  # plain numba stores what it compiles by itself, as it is called
         return
     seconds = about_s(kernels, cores())
-    if not store.can_save():
+    if not storing.can_save():
         message = (
             f"compiled kernels cannot be stored in {store.folder_of_kernels()}: each process compiles its own, "
             f"about {seconds:.0f} s. Set NUMBA_CACHE_DIR to a folder"

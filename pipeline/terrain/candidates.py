@@ -295,18 +295,17 @@ def are_glass(sums: IntArray, candidate: IntArray, count: int) -> BoolArray:
 def may_join(kind: KindArray, sums: IntArray, faults: KindArray, settings: CandidateSettings) -> BoolArray:
     """Which surfaces (k,) may belong to a larger roof across a step or a seam.
 
-    They are roof-like, and mostly bounded by steps, like a dormer, a lift house or an upper storey; or they go on in
-    the larger roof without a wall, of which the classes of the file name one part only.
+    They are roof-like or classified, and mostly bounded by steps, like a dormer, a lift house or an upper storey; or
+    they go on in the larger roof without a wall, of which the classes of the file name one part only.
     """
     f = _figures(sums)
     small_roof = np.isin(faults, (Fault.TOO_SMALL, Fault.TOO_NARROW, Fault.BELOW_Z_AVG))
     small_roof &= f["top_m"] >= settings.min_height_m
     small_roof &= f["planar_share"] >= settings.min_planar_share
     small_roof &= f["canopy_share"] <= settings.max_canopy_share
-    roof_like = (faults == Fault.NONE) | small_roof
-    joins: BoolArray = roof_like & (f["step_share"] >= settings.unite_share)
-    by_class = (kind == FacetKind.BUILDING) & (faults == Fault.TOO_SMALL)
-    joins |= (roof_like | by_class) & (f["seam_m"] >= _LEAST_SEAM_M)
+    small_roof |= (kind == FacetKind.BUILDING) & (faults == Fault.TOO_SMALL)
+    joins: BoolArray = (faults == Fault.NONE) | small_roof
+    joins &= (f["step_share"] >= settings.unite_share) | (f["seam_m"] >= _LEAST_SEAM_M)
     return np.isin(kind, (FacetKind.OBJECT, FacetKind.BUILDING)) & joins
 
 

@@ -14,15 +14,13 @@ import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
-from pipeline.terrain.roof_patches import Borders, GrownPatches, Patches
+from pipeline.terrain.roof_patches import MIN_TURN, Borders, GrownPatches, Patches, cosine, has_directions
 
 # Not settings: they say what a curved surface is, as those of patches say what a plane is.
-_MIN_TURN, _MAX_TURN = math.cos(math.radians(3.0)), math.cos(math.radians(60.0))
-"""Cosines of the angles between patches that follow each other on a curve: less is one plane, more an edge."""
+_MAX_TURN = math.cos(math.radians(60.0))
+"""Cosine of the angle between patches that follow each other on a curve: a larger one is an edge."""
 _MIN_BEND_M = 0.02
 """A plane passes over the middle of the next patch of a curve, by at least this."""
-_DIRECTIONS = 5
-"""Directions of a curve, no two within the least turn: roofs of planes with one ridge have four."""
 _NEAR_MM = 120.0
 """A vertex this near to a surface lies on it: four times the noise of a survey without offsets of strips."""
 _GOES_ON_MM = 300.0
@@ -163,14 +161,13 @@ def _distances_from_quadric(xyz: FloatArray, fitted: BoolArray, near: float) -> 
     return out
 
 
-def curved_surfaces(grown: GrownPatches, patches: Patches, borders: Borders) -> LabelArray:
-    """The curved surface of each patch of a roof, (k,) int32 as the number of one of its patches; -1 for none."""
+def curved_surfaces(grown: GrownPatches, patches: Patches, borders: Borders, normals: FloatArray) -> LabelArray:
+    """The curved surface of each patch of a roof, (k,) int32 as the number of one of its patches; -1 for none.
+
+    `normals` (k, 3) are of unit length. Roofs with too few directions for a curve are for the caller to leave out.
+    """
     count = len(patches.areas_m2)
     surface = np.full(count, -1, np.int32)
-    normals = np.column_stack((-patches.slopes, np.ones(count)))
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    if not _has_directions(normals):
-        return surface
     beside = _bending(patches, borders, normals)
     xyz = np.column_stack(grown.vertices[:3]).astype(np.float64)
     held = np.bincount(patches.of_vertex, minlength=count)
@@ -188,18 +185,13 @@ def _bending(patches: Patches, borders: Borders, normals: FloatArray) -> dict[in
     """The patches beside each one towards which the roof bends outwards as a curve may."""
     beside: dict[int, set[int]] = {}
     for p, q in zip(borders.first.tolist(), borders.second.tolist(), strict=True):
-        if not _MAX_TURN <= _cosine(normals[p], normals[q]) <= _MIN_TURN:
+        if not _MAX_TURN <= cosine(normals[p], normals[q]) <= MIN_TURN:
             continue
         over = min(_above(patches, p, q), _above(patches, q, p))
         if over >= _MIN_BEND_M:
             beside.setdefault(p, set()).add(q)
             beside.setdefault(q, set()).add(p)
     return beside
-
-
-def _cosine(one: FloatArray, other: FloatArray) -> float:
-    """Cosine of the angle between unit normals (3,); written out, since a matrix product differs between machines."""
-    return float(one[0] * other[0] + one[1] * other[1] + one[2] * other[2])
 
 
 def _above(patches: Patches, p: int, q: int) -> float:
@@ -235,19 +227,8 @@ def _grown_surface(
 
 def _is_curve(members: list[int], normals: FloatArray, xyz: FloatArray, patches: Patches) -> bool:
     """Whether patches are one curved surface: large, of many directions, and nearly all of it on one quadric."""
-    if not members or patches.areas_m2[members].sum() < _LEAST_M2 or not _has_directions(normals[members]):
+    if not members or patches.areas_m2[members].sum() < _LEAST_M2 or not has_directions(normals[members]):
         return False
     inside = np.isin(patches.of_vertex, members)
     away = _distances_from_quadric(xyz, inside, _NEAR_MM)
     return bool(np.mean(away[inside] <= _NEAR_MM) >= _ON_SURFACE)
-
-
-def _has_directions(normals: FloatArray) -> bool:
-    """Whether some of the normals (k, 3), as many as a curve has, are no nearer to each other than the least turn."""
-    kept: list[FloatArray] = []
-    for normal in normals[np.isfinite(normals).all(axis=1)]:
-        if all(_cosine(normal, other) <= _MIN_TURN for other in kept):
-            kept.append(normal)
-            if len(kept) == _DIRECTIONS:
-                return True
-    return False

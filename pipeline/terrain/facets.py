@@ -59,6 +59,17 @@ class VertexKind(IntEnum):
     """Undecided by its class, and on one plane with building around it."""
 
 
+class OnRoof(IntEnum):
+    """Where an undecided vertex lies."""
+
+    NO = 0
+    """On no roof."""
+    BESIDE = 1
+    """Between vertices of a roof, off its plane by less than the reach: a chimney, a strip that does not fit."""
+    YES = 2
+    """On the plane of a roof."""
+
+
 class SceneVertices(NamedTuple):
     """Thinned points of a scene, the vertices of its TIN; arrays of one length v, absolute mm."""
 

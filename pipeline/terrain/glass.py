@@ -15,7 +15,7 @@ import numpy as np
 from pipeline.compiler import kernel
 from pipeline.model import BoolArray, IntArray, KindArray
 from pipeline.terrain.facets import SceneVertices, VertexKind
-from pipeline.terrain.sparse_glass import are_low, under_sparse_glass
+from pipeline.terrain.glass_squares import Part, parts_of, possible_glass
 
 # Not settings: they say what glass is, in squares that hold a few points each.
 _SIDE_MM, _NEAR = 1000, 4
@@ -147,9 +147,14 @@ def glass_of(
     """
     (x_mm, y_mm), (ground_mm, least_mm) = places_mm, limits_mm
     at, under, seen = (np.zeros(n, np.bool_) for n in (len(vertices.x_mm), len(vertices.x_mm), len(x_mm)))
-    low = are_low(vertices, least_mm)
+    low = parts_of(vertices, least_mm) == Part.LOW
     if len(vertices.x_mm):
-        at, under, seen = under_sparse_glass(vertices._replace(planar=over_plants), x_mm, y_mm, used, least_mm)
+        over = vertices._replace(planar=over_plants)
+        part, high, may_be = possible_glass(over, x_mm, y_mm, used, least_mm)
+        if may_be.any():
+            from pipeline.terrain.sparse_glass import under_sparse_glass
+
+            at, under, seen = under_sparse_glass(over, part, high, may_be, x_mm, y_mm)
         squares = _squares(vertices, x_mm, y_mm, used, height_mm < ground_mm, least_mm)
         glass = _glass(squares)
         in_squares = _in_squares(vertices.x_mm, vertices.y_mm, squares, glass)

@@ -9,7 +9,6 @@ leaves out is judged as a surface of its own, and joins the building along its s
 from __future__ import annotations
 
 import math
-from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +17,7 @@ from pipeline.compiler import kernel
 from pipeline.kernels.normal_equations import solve_plane_moments
 from pipeline.model import BoolArray, FloatArray, IntArray, KindArray
 from pipeline.spatial_hash import points_by_cell
+from pipeline.terrain.facets import OnRoof
 from pipeline.terrain.reach import PLANARITY_SCALES
 from pipeline.terrain.terrain_settings import VegetationSettings
 
@@ -28,17 +28,6 @@ _FEWEST = 3
 """Building vertices that draw a plane."""
 _RESIDUALS = 2.0
 """Farthest from the plane of the others that a vertex on it lies, in the largest standard deviation of a window."""
-
-
-class OnRoof(IntEnum):
-    """Where an undecided vertex lies."""
-
-    NO = 0
-    """On no roof."""
-    BESIDE = 1
-    """Between vertices of a roof, off its plane by less than the reach: a chimney, a strip that does not fit."""
-    YES = 2
-    """On the plane of a roof."""
 
 
 class _Windows(NamedTuple):
@@ -169,8 +158,6 @@ def undecided_on_roofs(
         Farthest from a roof that a vertex lies beside it.
     """
     verdict = np.where(wanted, np.int8(-1), np.int8(OnRoof.NO))
-    if not building.any() or not wanted.any():
-        return np.zeros(len(wanted), np.int8)
     for scale in range(PLANARITY_SCALES):
         windows = _Windows(
             radius=1000.0 * settings.radius_m * 2**scale,

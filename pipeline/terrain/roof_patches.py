@@ -40,6 +40,10 @@ _NARROW_MM = 300.0
 """Standard deviation across of points about a metre wide."""
 MIN_COSINE = math.cos(math.radians(18.0))
 """Cosine of the largest angle between a patch and the surroundings of its vertices, or another patch of its slope."""
+MIN_TURN = math.cos(math.radians(3.0))
+"""Cosine of the angle between patches from which on they have different directions: a larger one is one plane."""
+_DIRECTIONS = 5
+"""Directions of a curve, no two within the least turn: roofs of planes with one ridge have four."""
 _UNKNOWN = 1e30
 """Deviation where a vertex has no plane around it."""
 _MAX_BESIDE_MM = 750.0
@@ -537,3 +541,19 @@ def _beside(step: FloatArray, slope: FloatArray, length: FloatArray, row: IntArr
     mean = np.bincount(row, length * away, minlength=rows) / np.maximum(np.bincount(row, length * near, rows), 1e-9)
     is_beside = near & (np.abs(away - mean[row]) <= half_edge_mm)
     return np.bincount(row, np.where(is_beside, length, 0.0), rows).astype(np.float64)
+
+
+def cosine(one: FloatArray, other: FloatArray) -> float:
+    """Cosine of the angle between unit normals (3,); written out, since a matrix product differs between machines."""
+    return float(one[0] * other[0] + one[1] * other[1] + one[2] * other[2])
+
+
+def has_directions(normals: FloatArray) -> bool:
+    """Whether some of the normals (k, 3), as many as a curve has, are no nearer to each other than the least turn."""
+    kept: list[FloatArray] = []
+    for normal in normals[np.isfinite(normals).all(axis=1)]:
+        if all(cosine(normal, other) <= MIN_TURN for other in kept):
+            kept.append(normal)
+            if len(kept) == _DIRECTIONS:
+                return True
+    return False

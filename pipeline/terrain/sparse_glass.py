@@ -5,20 +5,21 @@ yards and around houses a low point has low neighbours. So a low vertex lies und
 most of the surrounded higher vertices near it have a low one among their nearest, and if low vertices do not cluster.
 Crowns, through which pulses pass by chance as well, are rough.
 
-Counts in squares rule out nearly all of a town or a wood before any neighbour is searched for.
+Counts in squares (`terrain.glass_squares`) rule out nearly all of a town or a wood before any neighbour is searched
+for.
 """
 
 from __future__ import annotations
 
 from enum import IntEnum
-from typing import NamedTuple
 
 import numpy as np
 
 from pipeline.compiler import kernel
-from pipeline.model import BoolArray, IntArray, KindArray, LabelArray
+from pipeline.model import BoolArray, IntArray, KindArray
 from pipeline.spatial_hash import points_by_cell
-from pipeline.terrain.facets import SceneVertices, VertexKind
+from pipeline.terrain.facets import SceneVertices
+from pipeline.terrain.glass_squares import FEWEST, FEWEST_LOW, Cells, Part, box_sums, count_in
 from pipeline.terrain.reach import GLASS_NEAR as NEAR
 from pipeline.terrain.reach import GLASS_SQUARE_MM as SQUARE_MM
 from pipeline.terrain.reach import GLASS_SQUARES as REACH
@@ -33,36 +34,12 @@ _FEWEST_AROUND = 5
 _NEAREST = 6
 """The nearest vertices of any kind: where 30 % of the pulses go through, seven in eight of a roof have a low one among
 as many."""
-_FEWEST_NEAR = 64
-"""Vertices in the squares around, two for 3 m2: where there are fewer, houses are mixed with what surrounds them."""
-_MOST_POINTS = 700
-"""Points in the squares around, 7 per m2: where there are more, the squares of `terrain.glass` hold enough."""
 _MIXED_SHARE = 0.6
 """Surrounded higher vertices that have a low one among their nearest. A sixth of the pulses make as many."""
 _COMPANY = 0.35
 """How much of the way from chance to keeping to itself the low vertices may have gone."""
-_LEVEL_SHARE = 0.8
-"""Share of the higher vertices whose surroundings are planar."""
-_PAIR_SHARE = 0.12
-"""Least share of the pairs of vertices in one quarter of a square, of a higher one and another, that have a low one. As
-large is the share of the pulses that go through glass; straight walls beside open ground make half as many."""
-_FEWEST, _FEWEST_LOW = 12, 8
-"""Surrounded higher vertices, and low ones: fewer show nothing."""
 _BELOW_MM = 1000
 """How far what is seen through a roof lies below it at least."""
-
-
-class _Part(IntEnum):
-    """What a vertex is."""
-
-    OTHER = 0
-    """As high as roofs, but no roof by its class."""
-    LOW = 1
-    """Below the height of roofs."""
-    ROUGH = 2
-    """At the height of roofs, with rough or unknown surroundings."""
-    ROOF = 3
-    """At the height of roofs, with planar surroundings, or building by its class."""
 
 
 class _Found(IntEnum):
@@ -80,23 +57,11 @@ class _Found(IntEnum):
     """Nearest vertices of these that are surrounded."""
 
 
-_LAYERS, _PARTS = len(_Found), len(_Part)
-_QUARTER_MM = SQUARE_MM // 2
-
-
-class _Cells(NamedTuple):
-    """Some of the vertices by squares."""
-
-    start: LabelArray
-    members: LabelArray
-    column0: int
-    row0: int
-    columns: int
-    rows: int
+_LAYERS = len(_Found)
 
 
 @kernel
-def _nearest(v: int, vertices: SceneVertices, cells: _Cells, found: IntArray) -> int:
+def _nearest(v: int, vertices: SceneVertices, cells: Cells, found: IntArray) -> int:
     """Fill `found` with the members of cells that are nearest to v, without v itself; how many there are within reach.
 
     Equal distances by number: vertices come sorted by (x, y).
@@ -149,7 +114,7 @@ def _are_around(v: int, vertices: SceneVertices, around: IntArray) -> bool:
 
 @kernel
 def _surrounded(
-    wanted: BoolArray, vertices: SceneVertices, part: KindArray, high: _Cells, most: int, out: BoolArray
+    wanted: BoolArray, vertices: SceneVertices, part: KindArray, high: Cells, most: int, out: BoolArray
 ) -> None:
     """Which wanted vertices (v,) lie among the nearest higher ones, up to `most`; low ones also lie well below them."""
     around = np.empty(most, np.int64)
@@ -160,12 +125,12 @@ def _surrounded(
         near, rise = min(count, _AROUND), 0
         for w in around[:near]:
             rise += vertices.z_mm[w] - vertices.z_mm[v]
-        if count >= _FEWEST_AROUND and (part[v] != _Part.LOW or rise >= near * _BELOW_MM):
+        if count >= _FEWEST_AROUND and (part[v] != Part.LOW or rise >= near * _BELOW_MM):
             out[v] = _are_around(v, vertices, around[:count])
 
 
 @kernel
-def _mixture(wanted: BoolArray, vertices: SceneVertices, part: KindArray, inner: BoolArray, every: _Cells) -> IntArray:
+def _mixture(wanted: BoolArray, vertices: SceneVertices, part: KindArray, inner: BoolArray, every: Cells) -> IntArray:
     """What the squares (layers, rows, columns) hold by their wanted vertices (v,), layers as in `_Found`."""
     out = np.zeros((_LAYERS, every.rows, every.columns), np.int64)
     near = np.empty(_NEAREST, np.int64)
@@ -176,8 +141,8 @@ def _mixture(wanted: BoolArray, vertices: SceneVertices, part: KindArray, inner:
         low, known = 0, 0
         for w in near[: _nearest(v, vertices, every, near)]:
             known += inner[w]
-            low += inner[w] and part[w] == _Part.LOW
-        if part[v] == _Part.LOW:
+            low += inner[w] and part[w] == Part.LOW
+        if part[v] == Part.LOW:
             out[_Found.LOW, r, c] += 1
             out[_Found.LOW_NEIGHBOURS, r, c] += low
             out[_Found.NEIGHBOURS, r, c] += known
@@ -188,77 +153,7 @@ def _mixture(wanted: BoolArray, vertices: SceneVertices, part: KindArray, inner:
 
 
 @kernel
-def _parts(vertices: SceneVertices, least_mm: int) -> KindArray:
-    """`_Part` of each vertex: by itself and how planar its surroundings are, as other tiles judge it, too."""
-    out = np.empty(len(vertices.x_mm), np.int8)
-    for v in range(out.size):
-        kind = vertices.kind[v]
-        if kind == VertexKind.BUILDING:
-            out[v] = _Part.ROOF
-        elif kind == VertexKind.GROUND or vertices.height_mm[v] < least_mm:
-            out[v] = _Part.LOW
-        elif kind == VertexKind.EXCLUDED:
-            out[v] = _Part.OTHER
-        else:
-            out[v] = _Part.ROOF if vertices.planar[v] > 0 else _Part.ROUGH
-    return out
-
-
-@kernel
-def _count(x_mm: IntArray, y_mm: IntArray, counted: BoolArray, cells: _Cells) -> IntArray:
-    """How many of the counted places (n,) lie in each square (rows, columns)."""
-    out = np.zeros((cells.rows, cells.columns), np.int64)
-    for i in range(counted.size):
-        if counted[i]:
-            r, c = y_mm[i] // SQUARE_MM - cells.row0, x_mm[i] // SQUARE_MM - cells.column0
-            if 0 <= r < cells.rows and 0 <= c < cells.columns:
-                out[r, c] += 1
-    return out
-
-
-@kernel
-def _held(vertices: SceneVertices, part: KindArray, cells: _Cells) -> IntArray:
-    """What the squares hold (layers, rows, columns): vertices of each `_Part`, and two layers of their quarters.
-
-    These are the higher vertices with others in the same quarter, and the share of low ones among these others, summed,
-    in thousandths.
-    """
-    rows, columns = cells.rows, cells.columns
-    out = np.zeros((_PARTS + 2, rows, columns), np.int64)
-    quarters = np.zeros((2, 2 * rows, 2 * columns), np.int64)
-    for v in range(part.size):
-        r, c = vertices.y_mm[v] // _QUARTER_MM - 2 * cells.row0, vertices.x_mm[v] // _QUARTER_MM - 2 * cells.column0
-        out[part[v], r // 2, c // 2] += 1
-        if part[v] != _Part.OTHER:
-            quarters[1 if part[v] == _Part.LOW else 0, r, c] += 1
-    for r in range(2 * rows):
-        for c in range(2 * columns):
-            high, low = quarters[0, r, c], quarters[1, r, c]
-            if high + low > 1:
-                out[_PARTS, r // 2, c // 2] += high
-                out[_PARTS + 1, r // 2, c // 2] += 1000 * high * low // (high + low - 1)
-    return out
-
-
-@kernel
-def _box_sums(squares: IntArray, near: int) -> IntArray:
-    """Sums of squares (rows, columns) up to `near` squares around each."""
-    rows, columns = squares.shape
-    sums = np.zeros((rows + 1, columns + 1), np.int64)
-    for r in range(rows):
-        for c in range(columns):
-            sums[r + 1, c + 1] = squares[r, c] + sums[r, c + 1] + sums[r + 1, c] - sums[r, c]
-    out = np.empty((rows, columns), np.int64)
-    for r in range(rows):
-        south, north = max(r - near, 0), min(r + near + 1, rows)
-        for c in range(columns):
-            west, east = max(c - near, 0), min(c + near + 1, columns)
-            out[r, c] = sums[north, east] - sums[south, east] - sums[north, west] + sums[south, west]
-    return out
-
-
-@kernel
-def _inside(x_mm: IntArray, y_mm: IntArray, squares: BoolArray, cells: _Cells) -> BoolArray:
+def _inside(x_mm: IntArray, y_mm: IntArray, squares: BoolArray, cells: Cells) -> BoolArray:
     """Which places (n,) lie in marked squares (rows, columns)."""
     out = np.zeros(x_mm.size, np.bool_)
     for i in range(x_mm.size):
@@ -269,38 +164,32 @@ def _inside(x_mm: IntArray, y_mm: IntArray, squares: BoolArray, cells: _Cells) -
 
 def _near(squares: BoolArray, near: int) -> BoolArray:
     """Squares (rows, columns) up to `near` squares from marked ones."""
-    marked: BoolArray = _box_sums(squares.astype(np.int64), near) > 0
+    marked: BoolArray = box_sums(squares.astype(np.int64), near) > 0
     return marked
 
 
-def _glass(vertices: SceneVertices, part: KindArray, every: _Cells, high: _Cells, may_be: BoolArray) -> BoolArray:
+def _glass(vertices: SceneVertices, part: KindArray, every: Cells, high: Cells, may_be: BoolArray) -> BoolArray:
     """Which squares (rows, columns) lie under glass, of those that may by what the squares around them hold."""
-    x, y, is_low = vertices.x_mm, vertices.y_mm, part == _Part.LOW
+    x, y, is_low = vertices.x_mm, vertices.y_mm, part == Part.LOW
     inner = np.zeros(part.size, np.bool_)
     # the squares around, and as far beyond them as their vertices have neighbours
-    for kind in (is_low, part >= _Part.ROUGH):
+    for kind in (is_low, part >= Part.ROUGH):
         searched = kind & _inside(x, y, _near(may_be, NEAR + REACH), every)
         _surrounded(searched, vertices, part, high, _AROUND, inner)
-        may_be &= _box_sums(_count(x, y, is_low & inner, every), NEAR) >= _FEWEST_LOW
+        may_be &= box_sums(count_in(x, y, is_low & inner, every), NEAR) >= FEWEST_LOW
         if not may_be.any():
             return may_be
     layers = _mixture(_inside(x, y, _near(may_be, NEAR), every), vertices, part, inner, every)
-    inner_high, mixed, low, low_neighbours, neighbours = (_box_sums(layer, NEAR) for layer in layers)
+    inner_high, mixed, low, low_neighbours, neighbours = (box_sums(layer, NEAR) for layer in layers)
     share = low / np.maximum(low + inner_high, 1)
     company = low_neighbours / np.maximum(neighbours, 1)
     by_chance = company <= share + _COMPANY * (1.0 - share)
-    found: BoolArray = may_be & (inner_high >= _FEWEST) & (mixed >= _MIXED_SHARE * inner_high) & by_chance
+    found: BoolArray = may_be & (inner_high >= FEWEST) & (mixed >= _MIXED_SHARE * inner_high) & by_chance
     return found
 
 
-def are_low(vertices: SceneVertices, least_mm: int) -> BoolArray:
-    """Which vertices (v,) are lower than roofs: ground and plants."""
-    low: BoolArray = _parts(vertices, least_mm) == _Part.LOW
-    return low
-
-
 def under_sparse_glass(
-    vertices: SceneVertices, x_mm: IntArray, y_mm: IntArray, used: BoolArray, least_mm: int
+    vertices: SceneVertices, part: KindArray, high: Cells, may_be: BoolArray, x_mm: IntArray, y_mm: IntArray
 ) -> tuple[BoolArray, BoolArray, BoolArray]:
     """Which vertices (v,) lie in squares of glass, which low ones of them under it, and which points (n,) in squares.
 
@@ -308,26 +197,17 @@ def under_sparse_glass(
     ----------
     vertices : SceneVertices
         Thinned points with their kinds and how planar their surroundings are, at least one, sorted by (x, y).
-    x_mm, y_mm, used : (n,)
-        All points, and which of them may be ground or roof.
-    least_mm : int
-        Height from which a vertex may be of a roof.
+    part, high, may_be
+        As by `possible_glass`; some square may be of glass.
+    x_mm, y_mm : (n,)
+        All points.
     """
     x, y = vertices.x_mm, vertices.y_mm
-    part = _parts(vertices, least_mm)
-    is_low, is_high = part == _Part.LOW, part >= _Part.ROUGH
-    high = _Cells(*points_by_cell(x, y, is_high, SQUARE_MM))
-    other, low, rough, roof, paired, mixed = (_box_sums(layer, NEAR) for layer in _held(vertices, part, high))
-    may_be = (low >= _FEWEST_LOW) & (rough + roof >= _FEWEST) & (other + low + rough + roof >= _FEWEST_NEAR)
-    may_be &= (roof >= _LEVEL_SHARE * (other + rough + roof)) & (mixed >= 1000 * _PAIR_SHARE * paired)
-    may_be &= _box_sums(_count(x_mm, y_mm, used, high), NEAR) <= _MOST_POINTS
-    glass = may_be
-    if may_be.any():
-        every = _Cells(*points_by_cell(x, y, np.ones(len(x), np.bool_), SQUARE_MM))
-        glass = _glass(vertices, part, every, high, may_be)
+    every = Cells(*points_by_cell(x, y, np.ones(len(x), np.bool_), SQUARE_MM))
+    glass = _glass(vertices, part, every, high, may_be)
     at, under = np.zeros((2, len(x)), np.bool_)
     if not glass.any():
         return at, under, np.zeros(len(x_mm), np.bool_)
     at = _inside(x, y, glass, high)
-    _surrounded(at & is_low, vertices, part, high, _AT_EDGES, under)
+    _surrounded(at & (part == Part.LOW), vertices, part, high, _AT_EDGES, under)
     return at, under, _inside(x_mm, y_mm, glass, high)

@@ -24,15 +24,16 @@ import numpy as np
 from pipeline.compiler import kernel
 from pipeline.kernels.union_find import root_of, unite, united
 from pipeline.model import FloatArray, IntArray, LabelArray
-from pipeline.terrain.curved_surfaces import curved_surfaces
 from pipeline.terrain.ridge_steps import Rows, cut_at_ridge_steps
 from pipeline.terrain.roof_patches import (
     MIN_COSINE,
     MIN_POINTS,
     Borders,
+    GrownPatches,
     Patches,
     RoofVertices,
     grown_patches,
+    has_directions,
     measured_patches,
 )
 from pipeline.terrain.terrain_settings import UnitSettings
@@ -308,6 +309,18 @@ def _rows(patches: Patches, borders: Borders) -> Rows:
     return Rows(ridges=np.array(ridges, np.int64), continued=np.array(continued, np.int64))
 
 
+def _curves(grown: GrownPatches, patches: Patches, borders: Borders) -> LabelArray:
+    """The curved surface of each patch, (k,) int32 as the number of one of its patches; -1 for none."""
+    count = len(patches.areas_m2)
+    normals = np.column_stack((-patches.slopes, np.ones(count)))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    if not has_directions(normals):
+        return np.full(count, -1, np.int32)
+    from pipeline.terrain.curved_surfaces import curved_surfaces  # roofs of a few planes have no curve
+
+    return curved_surfaces(grown, patches, borders, normals)
+
+
 def units_of(
     x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, settings: UnitSettings, strips: IntArray | None = None
 ) -> LabelArray:
@@ -343,7 +356,7 @@ def units_of(
     grown, roof, house = cut_at_ridge_steps(grown, borders, rows, strip, settings.min_ridge_step_m)
     if len(roof) > len(patches.areas_m2):
         patches, borders = measured_patches(grown, settings.min_step_m)
-    curve = curved_surfaces(grown, patches, borders)
+    curve = _curves(grown, patches, borders)
     unit_of_patch = units_of_patches(patches, borders, roof, house, curve, settings)
     if (unit_of_patch == unit_of_patch[0]).all():
         return one

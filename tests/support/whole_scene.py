@@ -4,9 +4,10 @@ import dataclasses
 
 import numpy as np
 
-from pipeline.model import IntArray, LabelArray
-from pipeline.scene import WindowPoints, split_tile, terrain_of
-from pipeline.terrain.ground import Terrain
+from pipeline.model import BoolArray, IntArray, LabelArray
+from pipeline.scene import WindowPoints, lattice_of, split_tile, usable_as_ground
+from pipeline.terrain.ground import Terrain, ground_of
+from pipeline.terrain.outliers import dense_enough
 from pipeline.terrain.surfaces import Fragments
 from pipeline.terrain.terrain_settings import ClassesInUse, SceneSettings
 from pipeline.tiling import Window
@@ -24,6 +25,21 @@ class WholeScene:
     terrain: Terrain
     outliers: int
     """Outliers in the core."""
+
+
+def terrain_of(
+    points: WindowPoints, window: Window, settings: SceneSettings, classes: ClassesInUse
+) -> tuple[Terrain, BoolArray]:
+    """Terrain of a window, and the mask of points that are not outliers.
+
+    A run does the same in stages: outliers by tile, the ground by larger blocks.
+    """
+    kept = dense_enough(points.x_mm, points.y_mm, points.z_mm, settings.outliers)
+    usable = usable_as_ground(points, kept, classes)
+    window_cells = lattice_of(window)
+    trusted = classes.ground
+    terrain = ground_of(points.x_mm, points.y_mm, points.z_mm, usable, window_cells, settings.ground, trusted=trusted)
+    return terrain, kept
 
 
 def split_alone(

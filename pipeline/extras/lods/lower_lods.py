@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 import shapely
+from shapely import MultiPolygon
 
 from pipeline.errors import BuildingError
 from pipeline.model import FloatArray, Plane, RoofFace, Solid
@@ -47,6 +48,7 @@ def lower_lods(
     settings: RoofSettings,
     lods: Sequence[str],
     is_sound: Callable[[Solid], bool],
+    outline_mm: MultiPolygon | None = None,
 ) -> list[LodParts]:
     """A building's model in LoD2.2 at the requested levels of detail, the finest first.
 
@@ -60,11 +62,13 @@ def lower_lods(
         Elevation of the floor, local metres.
     lods : sequence of str
         Some of 1.2, 1.3 and 2.2.
+    outline_mm : MultiPolygon, optional
+        What the models stay within.
     """
     whole = block_plane(points, ground_z_m, settings.block_height_percentile)
     forms: Mapping[str, Callable[[SolidPart], Iterator[LevelPart]]] = {
-        "1.3": lambda part: level_forms(part, points, whole, ground_z_m, settings),
-        "1.2": lambda part: block_forms(part, whole, ground_z_m),
+        "1.3": lambda part: level_forms(part, points, whole, ground_z_m, settings, outline_mm),
+        "1.2": lambda part: block_forms(part, whole, ground_z_m, outline_mm),
     }
     models = [detailed] if detailed.lod in lods else []
     for lod, drawn in forms.items():
@@ -100,14 +104,21 @@ def _numbered_through(lod: str, levels: Sequence[LevelPart]) -> LodParts:
     return LodParts(lod=lod, parts=parts, planes=planes)
 
 
-def block_forms(part: SolidPart, level: Plane, ground_z_m: float) -> Iterator[LevelPart]:
+def block_forms(
+    part: SolidPart, level: Plane, ground_z_m: float, outline_mm: MultiPolygon | None = None
+) -> Iterator[LevelPart]:
     """Ways to draw one part of a building, with its roof faces of LoD2.2, as a block (LoD1.2); fewer vertices first."""
     polygons = [_polygon_mm(face) for face in part.faces]
-    yield from _drawn([polygons], [level], ground_z_m)
+    yield from _drawn([polygons], [level], ground_z_m, outline_mm)
 
 
 def level_forms(
-    part: SolidPart, points: FloatArray, level: Plane, ground_z_m: float, settings: RoofSettings
+    part: SolidPart,
+    points: FloatArray,
+    level: Plane,
+    ground_z_m: float,
+    settings: RoofSettings,
+    outline_mm: MultiPolygon | None = None,
 ) -> Iterator[LevelPart]:
     """Ways to draw one part of a building in levels (LoD1.3), the best first.
 
@@ -126,12 +137,14 @@ def level_forms(
         The horizontal roof where none of the points lies over the part.
     ground_z_m : float
         Elevation of the floor, local metres.
+    outline_mm : MultiPolygon, optional
+        What the part stays within.
     """
     polygons = [_polygon_mm(face) for face in part.faces]
     borders = _borders(part.faces)
     heights = _heights_over(polygons, points)
     if not any(len(z) for z in heights):
-        yield from _drawn([polygons], [level], ground_z_m)
+        yield from _drawn([polygons], [level], ground_z_m, outline_mm)
         return
     regions = _Regions(polygons, heights, borders, settings.block_height_percentile)
     regions.unite_without_step(settings.level_step_m)
@@ -139,7 +152,7 @@ def level_forms(
         pass
     for form in itertools.count(1):
         planes = [block_plane(z, ground_z_m, settings.block_height_percentile) for z in regions.points()]
-        yield from _drawn(regions.polygons(), planes, ground_z_m)
+        yield from _drawn(regions.polygons(), planes, ground_z_m, outline_mm)
         if not regions.unite_closest(math.inf, 0.0):
             return
         while form >= _MAX_FORMS and regions.unite_closest(math.inf, 0.0):
@@ -268,7 +281,10 @@ class _Regions:
 
 
 def _drawn(
-    regions: Sequence[Sequence[shapely.Polygon]], planes: Sequence[Plane], ground_z_m: float
+    regions: Sequence[Sequence[shapely.Polygon]],
+    planes: Sequence[Plane],
+    ground_z_m: float,
+    outline_mm: MultiPolygon | None,
 ) -> Iterator[LevelPart]:
     """Level parts as one closed solid: without idle vertices, then with all."""
     polygons: list[shapely.Polygon] = []
@@ -280,7 +296,7 @@ def _drawn(
     for drawn in (without_idle_vertices(polygons), polygons):
         partition = RoofPartition(polygons=tuple(drawn), labels=np.array(labels, np.int32))
         try:
-            parts = solid_parts(partition, planes, ground_z_m)
+            parts = solid_parts(partition, planes, ground_z_m, outline_mm)
         except BuildingError:
             continue
         if len(parts) == 1:

@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 import shapely
+from shapely import MultiPolygon
 
 from pipeline.model import FaceKind, FloatArray, Solid, SolidFace
 from pipeline.roof.solid import SolidPart
@@ -17,10 +18,10 @@ _FLUSH_M = 1.5e-3
 Ring = tuple[int, ...]
 
 
-def unite_flush_walls(part: SolidPart) -> SolidPart:
+def unite_flush_walls(part: SolidPart, limit_mm: MultiPolygon | None = None) -> SolidPart:
     """Unite neighbouring outer walls of a closed solid that lie in one plane, and drop the floor's corner between them.
 
-    The same object comes back where no two walls are flush.
+    The same object comes back where no two walls are flush, or where the part would leave a limit.
     """
     solid = part.solid
     faces = list(solid.faces)
@@ -32,7 +33,9 @@ def unite_flush_walls(part: SolidPart) -> SolidPart:
                 dropped.add(corner)
     if not dropped:
         return part
-    return _without(part, faces, dropped)
+    united = _without(part, faces, dropped)
+    floor_mm = shapely.transform(united.footprint, lambda xy: np.rint(xy * 1e3))
+    return united if limit_mm is None or shapely.covers(limit_mm, floor_mm) else part
 
 
 def _is_flush(vertices: FloatArray, ring: list[int], corner: int) -> bool:

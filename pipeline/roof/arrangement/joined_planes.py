@@ -4,8 +4,8 @@ Fitted one by one, three planes that meet in one corner of a roof miss it by cen
 and clusters of vertices there. Each condition "these two planes have one height over this vertex" is linear, so least
 squares under it is one step of a Kalman filter with an exact measurement (Kalman 1960), in which the noise of its
 points weighs each plane: a plane that they determine well moves less. Conditions come in order of their costs. One that
-costs more points than a corner must save is left out, and so is one that moves a plane farther from its points than the
-settings allow: such a gap is real, or the corner lies in the wrong place.
+costs more points than the corners of a gap must save is left out, and so is one that moves a plane farther from its
+points than the settings allow: such a gap is real, or the corner lies in the wrong place.
 """
 
 from __future__ import annotations
@@ -24,6 +24,8 @@ _FEWEST_POINTS = 6
 """Planes with fewer points keep their coefficients: twice as many as there are coefficients."""
 _MAX_GAP_M = 0.25
 """Wider gaps are steps. Not a setting: hardly more than what planes that share a corner miss it by (`corner_gap_m`)."""
+_CORNERS = 4.0
+"""Corners that a gap costs: there is a wall in it, and each of the edges beside it is two."""
 _EXACT_M = 1e-12
 """Variance over noise below which earlier conditions hold a gap as it is; numerical guard."""
 _LEAST_NOISE_M = 0.01
@@ -178,7 +180,7 @@ def joined_planes(
     factors, index, gaps = _terms(borders, _conditions(borders, k), planes, middle)
     is_open = np.full(len(gaps), limits.plane_shift_m > 0.0)
     # the sum of |residuals| of a point rises by d^2 / (sqrt(2 pi) noise) if its plane moves by d; the cap is one point
-    max_rise_m = limits.corner_cost * limits.cap_m * math.sqrt(2.0 * math.pi)
+    max_rise_m = _CORNERS * limits.corner_cost * limits.cap_m * math.sqrt(2.0 * math.pi)
     change, trial, gain = np.zeros(3 * k), np.empty(3 * k), np.empty(3 * k)
     while True:
         i, gap, variance = _cheapest(factors, index, gaps, change, covariance, is_open, max_rise_m)

@@ -37,6 +37,8 @@ _ALONG = 0.75
 _SMEARED_SHARE = 0.1
 """Share of a sliver's points that misfit its own plane from which on they are those of a wall, smeared by the beam: the
 points of a parapet's top fit it, those of a wall are spread over its height."""
+_LOW_SHARE = 0.5
+"""Misfit per point of a sliver up to which a neighbour's plane explains it: a rim that is no higher than the roof."""
 
 
 @kernel
@@ -232,11 +234,14 @@ def _borders_of_faces(faces: LabelArray, count: int, pairs: IntArray, weights: I
 
 
 @kernel(inline="always")
-def _fitted(misfits: IntArray, label_of: LabelArray, held: IntArray) -> BoolArray:
-    """Whether the points of each face, (f,), fit its own plane; `misfits` (f, k) and points `held` (f,) are sums."""
+def _fitted(misfits: IntArray, label_of: LabelArray, held: IntArray, keys: IntArray) -> BoolArray:
+    """Whether the points `held` by each face, (f,), fit its plane and no neighbour's; keys of `_borders_of_faces`."""
     is_fitted = np.empty(len(held), np.bool_)
     for f in range(len(held)):
         is_fitted[f] = misfits[f, label_of[f]] < _SMEARED_SHARE * COST_SCALE * held[f]
+    for key in keys:
+        f, g = key // len(held), key % len(held)
+        is_fitted[f] &= misfits[f, label_of[g]] >= _LOW_SHARE * COST_SCALE * held[f]
     return is_fitted
 
 
@@ -340,7 +345,7 @@ def unite_faces(
         if best_face >= 0:
             sliver = -1
         else:
-            is_fitted = _fitted(data, label_of, inside)
+            is_fitted = _fitted(data, label_of, inside, keys)
             sliver = _narrowest_sliver(plan, areas, faces, is_fitted, limits.min_face_width_m)
             if sliver < 0:
                 return

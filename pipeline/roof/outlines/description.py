@@ -109,6 +109,25 @@ def _end_price(angle: float, is_first: bool, is_last: bool, met: FloatArray, pri
     return price
 
 
+@kernel(inline="always")
+def _own_direction(moments: tuple[float, float, float], cx: float, cy: float) -> tuple[float, float]:
+    """The angle of the line through a stretch with moments xx, xy and yy, and how far its chord goes along it."""
+    sxx, sxy, syy = moments
+    angle = 0.5 * math.atan2(2.0 * sxy, sxx - syy)
+    along = math.cos(angle) * cx + math.sin(angle) * cy
+    return angle if along >= 0.0 else angle + math.pi, along
+
+
+@kernel(inline="always")
+def _turn(best: FloatArray, turns: FloatArray, before: FloatArray, through: IntArray) -> None:
+    """Fill in the best description before an edge in each state (2 d + 1,), and the state of the edge before it."""
+    for b in range(len(best)):
+        for a in range(len(best)):
+            total = best[a] + turns[a, b]
+            if total < before[b]:
+                before[b], through[b] = total, a
+
+
 @kernel
 def least_description(
     border: FloatArray, breaks: IntArray, directions: FloatArray, per_mm: float, prices: Prices, met: FloatArray
@@ -138,7 +157,7 @@ def least_description(
     """
     m, d = len(breaks), len(directions)
     free = 2 * d
-    n = len(border)
+    xy = border[breaks % len(border)]
     sums = _moments(border, breaks)
     turns = _turns(directions, prices)
     cosines, sines = np.cos(directions), np.sin(directions)
@@ -155,9 +174,11 @@ def least_description(
     alive = 1
     spare = prices.edge + prices.free + prices.change + max(prices.sharp, prices.flat)
     for j in range(1, m):
-        xj, yj = border[breaks[j] % n, 0], border[breaks[j] % n, 1]
         reached = np.full(alive, np.inf)
-        for place in range(alive):
+        # the start that won last goes first: few of the others then need their angles
+        lead = np.searchsorted(live[:alive], max(start[j - 1, free], 0))
+        for turn in range(alive):
+            place = lead if turn == 0 else turn - (turn <= lead)
             i = live[place]
             w = sums[j, 0] - sums[i, 0]
             if w <= 0.0:
@@ -167,42 +188,36 @@ def least_description(
             sxx = (sums[j, 3] - sums[i, 3]) / w - mx * mx
             sxy = (sums[j, 4] - sums[i, 4]) / w - mx * my
             syy = (sums[j, 5] - sums[i, 5]) / w - my * my
-            cx, cy = xj - border[breaks[i] % n, 0], yj - border[breaks[i] % n, 1]
+            cx, cy = xy[j, 0] - xy[i, 0], xy[j, 1] - xy[i, 1]
             scale = w * per_mm
             for k in range(d + 1):
+                state, angle, along = free, 0.0, 0.0
                 if k < d:
                     off = sines[k] * sines[k] * sxx - 2.0 * sines[k] * cosines[k] * sxy + cosines[k] * cosines[k] * syy
                     along = cosines[k] * cx + sines[k] * cy
                     state = 2 * k if along >= 0.0 else 2 * k + 1
                     angle = directions[k] if along >= 0.0 else directions[k] + math.pi
-                    price = prices.edge
                 else:
                     off = 0.5 * (sxx + syy) - math.sqrt(0.25 * (sxx - syy) ** 2 + sxy * sxy)
-                    angle = 0.5 * math.atan2(2.0 * sxy, sxx - syy)
-                    along = math.cos(angle) * cx + math.sin(angle) * cy
-                    state = free
-                    price = prices.edge + prices.free
-                    if along < 0.0:
-                        angle += math.pi
                 unexplained = before[i, state] + scale * max(off, 0.0)
                 reached[place] = min(reached[place], unexplained)
-                total = unexplained + price
-                if total >= best[j, state] or abs(along) < _LEAST_PROGRESS * w:
+                total = unexplained + (prices.edge if k < d else prices.edge + prices.free)
+                if total > best[j, state]:
+                    continue
+                if k == d:
+                    angle, along = _own_direction((sxx, sxy, syy), cx, cy)
+                if abs(along) < _LEAST_PROGRESS * w:
                     continue
                 last = through[i, state]
                 total += _end_price(angle, i == 0, j == m - 1, met, prices)
                 if i > 0 and free in (state, last):
-                    turn = angle - angles[i, last]
-                    total += _turn_price(math.cos(turn), math.sin(turn), prices)
-                    if total >= best[j, state]:
-                        continue
+                    bend = angle - angles[i, last]
+                    total += _turn_price(math.cos(bend), math.sin(bend), prices)
+                if total > best[j, state] or (total == best[j, state] and i > start[j, state]):
+                    continue
                 best[j, state], start[j, state], came[j, state], angles[j, state] = total, i, last, angle
         least = np.min(best[j])
-        for b in range(free + 1):
-            for a in range(free + 1):
-                total = best[j, a] + turns[a, b]
-                if total < before[j, b]:
-                    before[j, b], through[j, b] = total, a
+        _turn(best[j], turns, before[j], through[j])
         kept = 0
         for place in range(alive):
             if reached[place] <= least + spare:

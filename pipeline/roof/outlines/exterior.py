@@ -22,7 +22,7 @@ from pipeline.compiler import kernel
 from pipeline.model import FloatArray, IntArray
 from pipeline.roof.edge_position import EdgePoints, mixed_pulse_reach_mm, outward_shift_mm
 from pipeline.roof.footprint import polygons_of
-from pipeline.roof.lines import Run, corners, crossing, fitted_run, projected
+from pipeline.roof.lines import Run, corners, crossing, fitted_runs, projected
 from pipeline.roof.outlines.description import FREE, SHARP, Prices, least_description
 from pipeline.roof.roof_settings import RoofSettings
 from pipeline.roof.snapped_rings import differ_by_more, on_grid, snapped_ring
@@ -132,10 +132,11 @@ def _straight_rings(
             break
         for k, (border, runs) in enumerate(described(rings, spacing_m * 1e3, factor * noise_mm)):
             if drawn[k] is None and len(runs) > 2:
-                drawn[k] = _ring_of(border, runs, least, noise_mm)
+                beside_mm = _MOVED * Polygon(border).length
+                drawn[k] = _ring_of(border, runs, least, beside_mm * noise_mm)
                 if drawn[k] is not None and points is not None:
                     _take_positions(border, runs, points, reach_mm)
-                    moved = _ring_of(border, runs, least, noise_mm + points.spacing_mm)
+                    moved = _ring_of(border, runs, least, beside_mm * (noise_mm + points.spacing_mm))
                     drawn[k] = drawn[k] if moved is None else moved
     return [raw if ring is None else ring for raw, ring in zip(borders, drawn, strict=True)]
 
@@ -144,18 +145,15 @@ def _of_few_points(border: FloatArray, spacing_m: float, points: EdgePoints, noi
     """The likeliest ring around few points: as described, or in two directions of any."""
     from pipeline.roof.outlines.few_points import directions, envelope_mm, likeliest, sharp_corners
 
+    raw = Polygon(border)
+    area_mm2, most_mm2 = raw.area, 4.0 * _MOVED * noise_mm * raw.length
     xy_mm = points.xy_mm.astype(np.float64)
-    near = shapely.contains_xy(shapely.buffer(Polygon(border), 1e3 * spacing_m), xy_mm)
-    xy_mm = xy_mm[near]
+    xy_mm = xy_mm[shapely.contains_xy(shapely.buffer(raw, 1e3 * spacing_m), xy_mm)]
     ring = _with_breaks(border, _BREAK_SPACINGS * spacing_m * 1e3)
-    area_mm2 = Polygon(border).area
-    ((own_border, own),) = described([ring], 1e3 * spacing_m, noise_mm)
     per_mm = 0.5 / (1e3 * spacing_m * noise_mm * noise_mm)
-    ways = [(own_border, own)]
-    ways += [
-        (border, _runs(ring, pairs_of([angle]), per_mm, PRICES._replace(free=PRICES.sharp))[0])
-        for angle in directions().tolist()
-    ]
+    square = PRICES._replace(free=PRICES.sharp)
+    ways = described([ring], 1e3 * spacing_m, noise_mm)
+    ways += [(border, _runs(ring, pairs_of([angle]), per_mm, square)[0]) for angle in directions().tolist()]
     drawings: list[tuple[float, FloatArray]] = []
     least = max(_LEAST_SPACINGS * spacing_m, _LEAST_M) * 1e3
     for along, runs in ways:
@@ -163,7 +161,7 @@ def _of_few_points(border: FloatArray, spacing_m: float, points: EdgePoints, noi
             shift = envelope_mm(run, xy_mm, area_mm2, 1.5e3 * spacing_m)
             run.x += shift * math.sin(run.direction)
             run.y -= shift * math.cos(run.direction)
-        found = _ring_of(along, runs, least, 4.0 * noise_mm) if len(runs) >= _FEWEST else None
+        found = _ring_of(along, runs, least, most_mm2) if len(runs) >= _FEWEST else None
         if found is not None:
             free = sum(not run.exact for run in runs)
             cost = PRICES.edge * len(found) + PRICES.free * free + PRICES.sharp * sharp_corners(found)
@@ -191,12 +189,13 @@ def described(rings: Sequence[_Ring], spacing_mm: float, noise_mm: float) -> lis
             if any(abs(off_square(angle, system)) < _APART for system in systems):
                 continue
             more = [*systems, angle]
-            for _ in range(2):
+            for is_last in (False, True):
                 found = [_runs(ring, pairs_of(more), per_mm, PRICES) for ring in rings]
                 cost = math.fsum(own_cost for _, own_cost in found) + _SYSTEM * len(more)
                 if better is None or cost < better[0]:
                     better = cost, more, [own for own, _ in found]
-                more = _more_exact(more, [(ring, own) for ring, (own, _) in zip(rings, found, strict=True)])
+                if not is_last:
+                    more = _more_exact(more, [run for own, _ in found for run in own if run.exact])
         if better is None or better[0] >= least:
             break
         least, systems, best = better
@@ -218,11 +217,9 @@ def _runs(
 ) -> tuple[list[Run], float]:
     """The edges of a ring, and the length of their description."""
     ends, of_edge, angles, cost = least_description(ring.border, ring.breaks, directions, per_mm, prices, met)
-    runs = []
-    for k, (index, angle) in enumerate(zip(of_edge.tolist(), angles.tolist(), strict=True)):
-        run = fitted_run(ring.border, int(ring.breaks[ends[k]]), int(ring.breaks[ends[k + 1]]))
+    runs = fitted_runs(ring.border, ring.breaks[ends])
+    for run, index, angle in zip(runs, of_edge.tolist(), angles.tolist(), strict=True):
         run.direction, run.exact = angle, index != FREE
-        runs.append(run)
     return runs, cost
 
 
@@ -274,18 +271,14 @@ def peaks_of(runs: Sequence[Run], most: int = _TRIED) -> list[float]:
     return found
 
 
-def _more_exact(systems: Sequence[float], drawn: Sequence[tuple[_Ring, list[Run]]]) -> list[float]:
+def _more_exact(systems: Sequence[float], runs: Sequence[Run]) -> list[float]:
     """The directions as the borders along their edges have them, on average."""
     offs: list[list[tuple[float, float]]] = [[] for _ in systems]
-    for ring, runs in drawn:
-        for run in runs:
-            if not run.exact:
-                continue
-            own = fitted_run(ring.border, run.first, run.last).direction
-            k = min(range(len(systems)), key=lambda k: abs(off_square(run.direction, systems[k])))
-            off = off_square(own, systems[k])
-            if abs(off) < _ABOUT:
-                offs[k].append((off, run.length**3))
+    for run in runs:
+        k = min(range(len(systems)), key=lambda k: abs(off_square(run.direction, systems[k])))
+        off = off_square(run.own, systems[k])
+        if abs(off) < _ABOUT:
+            offs[k].append((off, run.length**3))
     return [
         system + (math.fsum(off * w for off, w in of) / math.fsum(w for _, w in of) if of else 0.0)
         for system, of in zip(systems, offs, strict=True)
@@ -402,9 +395,9 @@ def _turned(ring: FloatArray, is_hole: bool) -> FloatArray:
     return np.concatenate((turned[start:], turned[:start]))
 
 
-def _ring_of(border: FloatArray, runs: Sequence[Run], least_mm: float, noise_mm: float) -> FloatArray | None:
-    """A sound ring through the corners of edges, if it lies near the raw one; small loops at corners are cut off."""
-    copies = [dataclasses.replace(run) for run in runs]
+def _ring_of(border: FloatArray, runs: Sequence[Run], least_mm: float, most_mm2: float) -> FloatArray | None:
+    """A sound ring through the corners of edges, if no more lies between it and the raw one; loops at corners go."""
+    copies = [Run(**vars(run)) for run in runs]
     places = corners(border, without_short(border, copies, least_mm), math.inf, closed=True)
     if len(places) < 3:
         return None
@@ -415,4 +408,4 @@ def _ring_of(border: FloatArray, runs: Sequence[Run], least_mm: float, noise_mm:
         if not parts:
             return None
         drawn = shapely.get_coordinates(max(parts, key=lambda part: part.area).exterior)[:-1]
-    return None if differ_by_more(drawn, border, _MOVED * noise_mm * Polygon(border).length) else drawn
+    return None if differ_by_more(drawn, border, most_mm2) else drawn

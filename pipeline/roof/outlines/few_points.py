@@ -12,8 +12,8 @@ from collections.abc import Iterable
 
 import numpy as np
 import shapely
-from shapely import Polygon
 
+from pipeline.compiler import kernel
 from pipeline.model import FloatArray
 from pipeline.roof.lines import Run
 from pipeline.roof.outlines.description import SHARP
@@ -37,16 +37,43 @@ def envelope_mm(run: Run, xy_mm: FloatArray, area_mm2: float, out_mm: float) -> 
     Moving it outwards costs area, n ln(area) in all; a point that it leaves outside costs its squared distance.
     """
     ux, uy = math.cos(run.direction), math.sin(run.direction)
-    dx, dy = xy_mm[:, 0] - run.x, xy_mm[:, 1] - run.y
-    off, along = dx * uy - dy * ux, dx * ux + dy * uy
-    beside = np.sort(off[(np.abs(along) <= 0.5 * run.length) & (np.abs(off) <= out_mm)])[::-1]
-    if len(beside) == 0 or run.length == 0.0:
+    return _envelope(xy_mm, (run.x, run.y), (ux, uy), run.length, area_mm2, out_mm)
+
+
+@kernel
+def _envelope(
+    xy: FloatArray,
+    at: tuple[float, float],
+    way: tuple[float, float],
+    length: float,
+    area: float,
+    out: float,
+) -> float:
+    """The same for a line through a place, with its direction as a unit vector."""
+    offs = np.empty(len(xy))
+    count = 0
+    for k in range(len(xy)):
+        dx, dy = xy[k, 0] - at[0], xy[k, 1] - at[1]
+        off, along = dx * way[1] - dy * way[0], dx * way[0] + dy * way[1]
+        if abs(along) <= 0.5 * length and abs(off) <= out:
+            offs[count] = off
+            count += 1
+    if count == 0 or length == 0.0:
         return 0.0
-    a_mm = len(xy_mm) * run.length / area_mm2
-    beyond = np.maximum(beside[:, None] - beside[None, :], 0.0)
-    outside = np.minimum(0.5 * (beyond / _OFF_MM) ** 2, _MOST).sum(axis=0)
+    a_mm = len(xy) * length / area
+    beside = np.sort(offs[:count])[::-1]
+    best, least = 0.0, np.inf
+    for off in beside:
+        outside = 0.0
+        for farther in beside:
+            if farther <= off:
+                break
+            beyond = (farther - off) / _OFF_MM
+            outside += min(0.5 * (beyond * beyond), _MOST)
+        if a_mm * off + outside < least:
+            best, least = off, a_mm * off + outside
     # the edge lies beyond its outermost point by the mean way to the next one
-    return float(beside[np.argmin(a_mm * beside + outside)]) + min(1.0 / a_mm, 0.5 * out_mm)
+    return float(best + min(1.0 / a_mm, 0.5 * out))
 
 
 def sharp_corners(ring: FloatArray) -> int:
@@ -62,11 +89,12 @@ def likeliest(drawings: Iterable[tuple[float, FloatArray]], xy_mm: FloatArray, s
     best, least = None, math.inf
     places = shapely.points(xy_mm)
     for cost, ring in drawings:
-        polygon = Polygon(ring)
-        if not polygon.is_valid or polygon.area <= 0.0:
+        polygon = shapely.polygons(ring)
+        area = float(shapely.area(polygon))
+        if area <= 0.0 or not shapely.is_valid(polygon):
             continue
         off = shapely.distance(places, polygon)
-        total = cost + len(xy_mm) * math.log(polygon.area / (1e3 * spacing_m) ** 2)
+        total = cost + len(xy_mm) * math.log(area / (1e3 * spacing_m) ** 2)
         total += float(np.minimum(0.5 * (off / _OFF_MM) ** 2, _MOST).sum())
         if total < least:
             best, least = ring, total

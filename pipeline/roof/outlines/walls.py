@@ -9,6 +9,7 @@ overlap.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import itertools
 import math
@@ -18,6 +19,7 @@ import numpy as np
 import shapely
 from shapely import LineString, MultiPolygon, Polygon
 
+from pipeline.errors import BuildingError
 from pipeline.model import FloatArray, IntArray, LabelArray
 from pipeline.roof.footprint import polygons_of
 from pipeline.roof.lines import Run, corners, fitted_run
@@ -35,6 +37,7 @@ from pipeline.roof.outlines.wall_ends import (
     without_stubs,
 )
 from pipeline.roof.partition import RoofPartition
+from pipeline.roof.simplification import unite_close_vertices
 
 _NEARBY_MM = 10_000.0
 """The outline's edges within this of a border give its directions."""
@@ -50,6 +53,8 @@ _STRAIGHT_ON = -0.8
 """Cosine between two borders, seen from where they meet: from 143 degrees on, one goes on in the other."""
 _WAY_MM = 2500.0
 """The direction of a border at its end is that of this much of it."""
+_CLOSE_MM = 10.0
+"""Corners of cells this near to each other are one."""
 _LEAST_CELL_MM2 = 2e6
 _LEAST_WIDTH_MM = 500.0
 """Smaller or narrower cells join the neighbour with the longest common wall."""
@@ -139,20 +144,46 @@ def _borders(units: RoofPartition, within: Polygon | MultiPolygon) -> list[Float
     """The borders between two units, (n, 2) each, as far as they lie within an area."""
     polygons = np.array(units.polygons, dtype=object)
     whole = [shapely.coverage_union_all(polygons[units.labels == number]) for number in np.unique(units.labels)]
-    lines = shapely.boundary(np.array(whole, dtype=object))
-    tree = shapely.STRtree(lines)
-    first, second = tree.query(lines, predicate="intersects")
     borders: list[FloatArray] = []
-    for a, b in sorted(zip(first.tolist(), second.tolist(), strict=True)):
-        if a >= b:
-            continue
-        common = shapely.line_merge(shapely.intersection(shapely.intersection(lines[a], lines[b]), within))
+    for stretches in _stretches(whole):
+        common = shapely.line_merge(shapely.intersection(shapely.multilinestrings(stretches), within))
         borders += [
             np.asarray(line.coords)
             for line in shapely.get_parts(common)
             if isinstance(line, LineString) and line.length > _SHORTEST_MM
         ]
     return borders
+
+
+def _stretches(shapes: Sequence[Polygon | MultiPolygon]) -> list[list[LineString]]:
+    """The lines that each two shapes of a coverage share, pair by pair: as the first one has them on its rings.
+
+    Shapes of a coverage have the same edges where they meet, which makes an overlay needless. A closed line begins at
+    its westernmost vertex.
+    """
+    parts, of_part = shapely.get_parts(np.array(shapes, dtype=object), return_index=True)
+    rings, of_ring = shapely.get_rings(parts, return_index=True)
+    xy, ring = shapely.get_coordinates(rings, return_index=True)
+    inside = ring[:-1] == ring[1:]
+    start, end, ring = xy[:-1][inside], xy[1:][inside], ring[:-1][inside]
+    own = of_part[of_ring[ring]]
+    is_turned = (start[:, 0] > end[:, 0]) | ((start[:, 0] == end[:, 0]) & (start[:, 1] > end[:, 1]))
+    edges = np.where(is_turned[:, None], np.column_stack((end, start)), np.column_stack((start, end)))
+    order = np.lexsort((own, *edges.T))
+    twin = np.flatnonzero((edges[order[:-1]] == edges[order[1:]]).all(axis=1))
+    edge, other = order[twin], own[order[twin + 1]]
+    order = np.lexsort((edge, other, own[edge]))
+    edge, other = edge[order], other[order]
+    goes_on = (np.diff(edge) == 1) & (np.diff(ring[edge]) == 0) & (np.diff(other) == 0)
+    found: dict[tuple[int, int], list[LineString]] = {}
+    for stretch in np.split(np.arange(len(edge)), np.flatnonzero(~goes_on) + 1):
+        if len(stretch):
+            line = np.concatenate((start[edge[stretch]], end[edge[stretch[-1:]]]))
+            if (line[0] == line[-1]).all():
+                first = int(np.lexsort(line[:-1, ::-1].T)[0])
+                line = np.concatenate((line[first:-1], line[: first + 1]))
+            found.setdefault((int(own[edge[stretch[0]]]), int(other[stretch[0]])), []).append(LineString(line))
+    return list(found.values())
 
 
 def _through(borders: Sequence[FloatArray]) -> list[FloatArray]:
@@ -278,9 +309,12 @@ def _counts(cell: Polygon, xy_mm: IntArray, unit: LabelArray, count: int) -> Int
 
 
 def _united(cells: Sequence[Polygon], owners: Sequence[int]) -> dict[int, MultiPolygon]:
-    """The cells of each unit as one shape."""
+    """The cells of each unit as one shape, without edges that a solid cannot have."""
+    drawn = RoofPartition(polygons=tuple(cells), labels=np.array(owners, np.int32))
+    with contextlib.suppress(BuildingError):  # where a cell breaks, all corners stay
+        drawn = unite_close_vertices(drawn, _CLOSE_MM)
+    polygons = np.array(drawn.polygons, dtype=object)
     found = {}
-    for number in sorted(set(owners) - {-1}):
-        own = [cell for cell, owner in zip(cells, owners, strict=True) if owner == number]
-        found[number] = MultiPolygon(polygons_of(shapely.union_all(own, grid_size=1.0)))
+    for number in sorted(set(drawn.labels.tolist()) - {-1}):
+        found[number] = MultiPolygon(polygons_of(shapely.coverage_union_all(polygons[drawn.labels == number])))
     return found

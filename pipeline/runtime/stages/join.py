@@ -299,7 +299,7 @@ def join(
     ]
     units = find_units(context, settings, roof, splits, owned, crs_name, outlines=outlines)
     joined = joined_of(units, small, splits.keys)
-    if outlines and roof.straight_eaves and may_touch(units.values()):
+    if outlines and may_touch(units.values()):
         from pipeline.runtime.stages.touching import drawn_apart
 
         joined = drawn_apart(context, roof, joined)

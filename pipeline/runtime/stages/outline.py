@@ -29,8 +29,6 @@ def outlined(
     A block that cannot be drawn does not end the run: its units lose their common walls and are drawn one by one.
     Raises MemoryError or OSError if scratch cannot be read, or does not fit into memory.
     """
-    if not settings.straight_eaves:
-        return list(sites), []
     blocks: dict[str, list[CandidateSite]] = {}
     for site in sites:
         if site.block is not None:

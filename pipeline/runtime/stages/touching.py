@@ -24,9 +24,11 @@ from pipeline.prepared_cloud import prepare_cloud
 from pipeline.roof.disjoint_outlines import Claim, divided, left_of
 from pipeline.roof.plan import drawn_outline, roof_points
 from pipeline.roof.roof_settings import RoofSettings
+from pipeline.roof.slits import GAP_MM, Slit, between, closed, slits, united, without
 from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import OpenScratch, Scratch
 from pipeline.runtime.scratch.outcomes import Files, InParts, Place, brief_within, drop_outcomes, key_of
+from pipeline.runtime.stages.beside import points_beside
 from pipeline.runtime.stages.gather import gather, points_of
 from pipeline.runtime.stages.sites import (
     CandidateSite,
@@ -39,7 +41,9 @@ from pipeline.runtime.stages.sites import (
     near_pairs,
 )
 from pipeline.runtime.stages.stored_sites import group_figures
-from pipeline.tiling import MM, Tile, TileGrid
+from pipeline.runtime.stages.window_points import surroundings_of
+from pipeline.terrain.lattice import CELL_MM
+from pipeline.tiling import MM, Tile, TileGrid, Window
 
 Result = TypeVar("Result")
 
@@ -48,6 +52,12 @@ STAGE = "touching"
 _BESIDE_MM = 2000.0
 """An outline that ends so near to another one stays as it was compared: with the hidden points at walls, which are
 known when it is modelled, it could become that much larger."""
+_CLOSE_MM = 2.0
+"""Outlines this near may overlap once their corners are rounded."""
+_LEAST_SEEN = 0.1
+"""A slit is closed where it holds at least so much of the points that a roof as large would."""
+_MOST_GROUND, _GROUND_MM = 0.1, 1000
+"""At most so many of them lie at the terrain, or less than this above it."""
 _HELD = 16
 """Candidates whose points stay in memory from one overlap to the next."""
 
@@ -154,19 +164,19 @@ def _outlines_of(
 
     What fails without a known reason leaves its candidates as they are drawn alone, with a warning.
     """
-    pairs = near_pairs(sites)
-    pairs = pairs[pairs[:, 0] < owned]
+    all_pairs = near_pairs(sites)
     drawn: dict[int, MultiPolygon] = {}
-    for k in np.unique(pairs).tolist():
+    for k in np.unique(all_pairs[all_pairs[:, 0] < owned]).tolist():
         task.scratch.check_cancelled()
         outline_mm = _or_warned(warnings, (sites[k],), functools.partial(_drawn_mm, sites[k], task))
         if outline_mm is not None:
             drawn[k] = outline_mm
-    known = np.array([i in drawn and j in drawn for i, j in pairs.tolist()], np.bool_)
-    pairs = pairs[known]
-    first, second = (np.array([drawn[k] for k in column.tolist()], object) for column in pairs.T)
-    near = shapely.dwithin(first, second, _BESIDE_MM)
-    overlapping = shapely.intersects(first, second)
+    all_pairs = np.array([(i, j) for i, j in all_pairs.tolist() if i in drawn and j in drawn], np.int64).reshape(-1, 2)
+    first, second = (np.array([drawn[k] for k in column.tolist()], object) for column in all_pairs.T)
+    taken = _taken(all_pairs[shapely.dwithin(first, second, GAP_MM)].tolist(), sites, drawn, task, warnings)
+    is_own = all_pairs[:, 0] < owned
+    near = all_pairs[is_own & shapely.dwithin(first, second, _BESIDE_MM)]
+    close = all_pairs[is_own & shapely.dwithin(first, second, _CLOSE_MM)]
 
     @functools.lru_cache(maxsize=_HELD)
     def claim(k: int) -> Claim:
@@ -174,28 +184,121 @@ def _outlines_of(
         places: IntArray = np.column_stack([points[axis] for axis in "xyz"]).astype(np.int64)
         return Claim(name=sites[k].building_id, outline_mm=drawn[k], points_mm=places)
 
-    def of_pair(i: int, j: int) -> tuple[list[shapely.Polygon], list[shapely.Polygon]]:
-        return divided(claim(i), claim(j))
+    def of_pair(i: int, j: int) -> tuple[MultiPolygon, MultiPolygon]:
+        first, second = (
+            dataclasses.replace(claim(k), outline_mm=united(drawn[k], taken.get((k, other), ())))
+            for k, other in ((i, j), (j, i))
+        )
+        return divided(first, second)
 
-    kept: dict[int, list[shapely.Polygon]] = collections.defaultdict(list)
-    lost: dict[int, list[shapely.Polygon]] = collections.defaultdict(list)
-    for i, j in pairs[overlapping].tolist():
+    # other units of its block were not compared with a unit: it keeps within its part of the block
+    kept = {k: {k: shape} if sites[k].block is not None else {} for k, shape in drawn.items()}
+    for i, j in sorted({*map(tuple, close.tolist()), *((i, j) for i, j in taken if i < j and i < owned)}):
         task.scratch.check_cancelled()
         parts = _or_warned(warnings, (sites[i], sites[j]), functools.partial(of_pair, i, j))
-        if parts is None:
-            continue
-        of_first, of_second = parts
-        kept[i] += of_first
-        lost[i] += of_second
-        kept[j] += of_second
-        lost[j] += of_first
+        if parts is not None:
+            kept[i][j], kept[j][i] = parts
     outlines = {}
-    for k in np.unique(pairs[near]).tolist():
+    for k in np.unique(near).tolist():
         if k < owned:
-            cut = functools.partial(left_of, drawn[k], kept[k], lost[k], task.roof.min_part_area_m2)
+            gained = {j: pieces for (of, j), pieces in taken.items() if of == k}
+            limits = [
+                united(shape, [piece for other, pieces in gained.items() if other != j for piece in pieces])
+                for j, shape in kept[k].items()
+            ]
+            cut = functools.partial(left_of, drawn[k], limits, task.roof.min_part_area_m2)
             apart = _or_warned(warnings, (sites[k],), cut)
             outlines[sites[k].building_id] = shapely.transform(drawn[k] if apart is None else apart, lambda xy: xy / MM)
     return outlines
+
+
+def _taken(
+    pairs: Sequence[Sequence[int]],
+    sites: Sequence[CandidateSite],
+    drawn: Mapping[int, MultiPolygon],
+    task: TouchTask,
+    warnings: list[str],
+) -> dict[tuple[int, int], list[shapely.Polygon]]:
+    """What the first of two candidates takes of the slits beside the second, and the second beside the first.
+
+    It keeps a millimetre away from third outlines, and from what others take.
+    """
+    taken: dict[tuple[int, int], list[shapely.Polygon]] = {}
+    for (i, j), found in _slits(pairs, sites, drawn, task, warnings).items():
+        if found:
+            parts = _or_warned(warnings, (sites[i], sites[j]), functools.partial(closed, drawn[i], drawn[j], found))
+            taken[i, j], taken[j, i] = parts or ([], [])
+    apart = {}
+    for (k, j), pieces in taken.items():
+        others = [outline for m, outline in drawn.items() if m not in (k, j)]
+        others += [piece for (m, _), of_other in taken.items() if m != k for piece in of_other]
+        apart[k, j] = [part for piece in pieces for part in without(piece, others)]
+    return apart
+
+
+def _slits(
+    pairs: Sequence[Sequence[int]],
+    sites: Sequence[CandidateSite],
+    drawn: Mapping[int, MultiPolygon],
+    task: TouchTask,
+    warnings: list[str],
+) -> dict[tuple[int, int], list[Slit]]:
+    """The slits between pairs of outlines that a wall or a roof fills, by pair: points lie in them, but no ground.
+
+    Those narrower than the point spacing may be empty. A task knows all outlines that reach into the boxes of both, so
+    another task finds the same slits.
+    """
+    ordered = [(j, i) if sites[j].building_id < sites[i].building_id else (i, j) for i, j in pairs]
+
+    def of_pair(i: int, j: int) -> list[Slit]:
+        if not around[i, j]:
+            return []
+        known = shapely.intersection(*(shapely.box(*(sites[k].reach_mm or ())) for k in (i, j)))
+        third = [outline for k, outline in drawn.items() if k not in (i, j) and outline.intersects(known)]
+        others = [area for pair, areas in around.items() if pair != (i, j) for area in areas if area.intersects(known)]
+        return slits((drawn[i], drawn[j]), around[i, j], shapely.buffer(known, -GAP_MM), third, others)
+
+    around = {}
+    for i, j in ordered:
+        areas = functools.partial(between, drawn[i], drawn[j])
+        around[i, j] = _or_warned(warnings, (sites[i], sites[j]), areas) or []
+    found = {}
+    for i, j in ordered:
+        found[i, j] = _or_warned(warnings, (sites[i], sites[j]), functools.partial(of_pair, i, j)) or []
+    areas_mm = [slit.area_mm for pair in ordered for slit in found[pair]]
+    heights = iter(_heights_in(areas_mm, task) if areas_mm else ())
+    return {
+        pair: [slit for slit in found[pair] if _is_built(slit, next(heights), pair, sites, drawn)] for pair in ordered
+    }
+
+
+def _is_built(
+    slit: Slit,
+    heights_mm: IntArray,
+    pair: Sequence[int],
+    sites: Sequence[CandidateSite],
+    drawn: Mapping[int, MultiPolygon],
+) -> bool:
+    per_mm2 = sum(sites[k].points for k in pair) / sum(drawn[k].area for k in pair)
+    is_thin = (2.0 * slit.area_mm.area / slit.area_mm.length) ** 2 * per_mm2 < 1.0
+    least = 0.0 if is_thin else max(1.0, _LEAST_SEEN * per_mm2 * slit.area_mm.area)
+    is_ground = heights_mm < _GROUND_MM
+    return len(heights_mm) >= least and bool(np.count_nonzero(is_ground) <= _MOST_GROUND * len(heights_mm))
+
+
+def _heights_in(areas_mm: Sequence[shapely.Polygon], task: TouchTask) -> list[IntArray]:
+    """The heights of the points in some areas above the terrain, of single and last returns, millimetres, by area."""
+    west, south, east, north = (round(value) for value in shapely.total_bounds(areas_mm))
+    around = surroundings_of(task.scratch, task.grid, Window(x0_mm=west, y0_mm=south, x1_mm=east + 1, y1_mm=north + 1))
+    boxes = shapely.bounds(areas_mm).astype(np.int64) // CELL_MM - np.tile([around.column0, around.row0], 2)
+    cells = np.zeros_like(around.occupied)
+    for x0, y0, x1, y1 in boxes.tolist():
+        cells[y0 : y1 + 1, x0 : x1 + 1] = True
+    places = np.concatenate(points_beside(task.scratch, task.grid, np.empty((0, 3), np.int64), cells, around))
+    columns, rows = (places[:, :2] // CELL_MM - [around.column0, around.row0]).T
+    heights_mm = places[:, 2] - around.elevation_mm[rows, columns]
+    area, inside = shapely.STRtree(shapely.points(places[:, :2])).query(areas_mm, predicate="contains")
+    return [heights_mm[inside[area == k]] for k in range(len(areas_mm))]
 
 
 def _or_warned(warnings: list[str], sites: Sequence[CandidateSite], draw: Callable[[], Result]) -> Result | None:

@@ -32,9 +32,9 @@ import os
 import shutil
 from pathlib import Path
 
-from pipeline.compiler import store
+from pipeline.compiler import store, storing
 
-loaded, saved = store.load, store.save
+loaded, saved = store.load, storing.save
 
 def keep(name):
     shutil.copy(store.folder_of_kernels() / (name + store.ENDING), os.environ["KEPT"])
@@ -49,7 +49,7 @@ def save(name, fingerprint, stored):
     saved(name, fingerprint, stored)
     keep(name)
 
-store.load, store.save = load, save
+store.load, storing.save = load, save
 """
 
 PROGRAM = [sys.executable, "-P", "-m", "service.cli"]

@@ -35,6 +35,16 @@ def test_the_shared_border_is_one_straight_line(halves: tuple[Candidate, LabelAr
     assert np.abs(x - 10.0).max() < 0.6
 
 
+def test_turned_units_share_every_corner() -> None:
+    random = np.random.default_rng(12)
+    x, y = random.uniform((0, 0), (20, 12), (1200, 2)).T
+    unit = np.where(y > 6.0, 2, np.where(x > 9.0, 1, 0)).astype(np.int32)
+    turned = np.exp(0.4j) * (x + 1j * y)
+    points = np.column_stack((turned.real.round(3), turned.imag.round(3), 6.0 + 2.0 * unit))
+    outlines = unit_outlines(candidate_of(points), unit, RoofSettings())
+    assert shapely.coverage_is_valid([shapely.transform(one, lambda xy: np.rint(xy * 1e3)) for one in outlines])
+
+
 def test_together_they_are_the_outline_of_the_whole(halves: tuple[Candidate, LabelArray]) -> None:
     candidate, unit = halves
     both = shapely.union_all(unit_outlines(candidate, unit, RoofSettings()))

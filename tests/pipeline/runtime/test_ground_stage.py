@@ -6,14 +6,14 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import pytest
-from whole_scene import seen_m
+from whole_scene import seen_m, terrain_of
 
 from pipeline.runtime.scratch.folder import POINT, Scratch
 from pipeline.runtime.stages import ground_stage as ground
 from pipeline.runtime.stages.cells_stage import CellsTask, TileCells, find_cells
 from pipeline.runtime.stages.ground_stage import GroundTask, TileGround, draw_ground, terrain_of_window, terrain_window
 from pipeline.runtime.stages.window_points import PointState, load_window, surroundings_of
-from pipeline.scene import WindowPoints, terrain_of
+from pipeline.scene import WindowPoints
 from pipeline.terrain.lattice import NO_DATA
 from pipeline.terrain.terrain_settings import APRON_M, ClassesInUse, GroundSettings, OutlierSettings, SceneSettings
 from pipeline.tiling import MM, Tile, TileGrid, Window

@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,6 +21,8 @@ from pipeline.tiling import Tile
 SHEDS = (((12.0, 12.0, 24.0, 20.0), 60.0), ((23.7, 13.0, 32.0, 19.0), 54.0), ((14.0, 19.7, 22.0, 27.0), 55.5))
 """Boxes and elevations of flat roofs; two are seen beneath the eaves of a much higher one. None touches the fourth."""
 ALONE = ((48.0, 48.0, 58.0, 56.0), 57.0)
+NOTHING_M2 = 1e-7
+"""A millimetre by 0.1 mm: coordinates in metres are no more exact."""
 TRUSTED = {"classes": "trust"}
 
 
@@ -37,6 +40,27 @@ def sheds(tmp_path: Path) -> Path:
     return write_houses(tmp_path / "sheds.laz", found, classes=np.where(house < 0, 2, 6))
 
 
+@pytest.fixture
+def town(tmp_path: Path) -> Path:
+    """Two rows of gables, back to back, of different heights and depths, and sheds before them, all turned."""
+    random = np.random.default_rng(23)
+    x, y = random.uniform(0.0, 60.0, (2, 25_200))
+    z, house = np.full(len(x), 50.0), np.full(len(x), -1, np.int8)
+    for k in range(10):
+        x0, deep = 14.0 + 6.3 * (k % 5), random.uniform(7.0, 10.0)
+        y0, y1 = (30.0 - deep, 30.0) if k < 5 else (30.0, 30.0 + deep)
+        inside = (x >= x0) & (x < x0 + 6.3) & (y >= y0) & (y < y1)
+        z[inside] = 57.0 + 2.5 * ((k + k // 5) % 3) - 0.7 * np.abs(y[inside] - 0.5 * (y0 + y1))
+        house[inside] = k
+        shed = (x >= x0 + 1.0) & (x < x0 + 5.0) & (np.abs(y - 30.0) < deep + 3.1) & (np.abs(y - 30.0) >= deep)
+        shed &= (y < 30.0) if k < 5 else (y > 30.0)
+        z[shed], house[shed] = 52.6 + 0.2 * k, 10 + k
+    z += random.normal(0.0, 0.02, len(x))
+    turn = np.exp(0.37j) * (x + 1j * y)
+    found = Houses(xyz=np.column_stack((turn.real + 400_000.0, turn.imag + 5_700_000.0, z)), house=house)
+    return write_houses(tmp_path / "town.laz", found, classes=np.where(house < 0, 2, 6))
+
+
 def overlaps_m2(run_dir: str) -> list[float]:
     """The overlap of each pair of outlines."""
     outlines = [shapely.force_2d(shapely.from_wkb(row["geometry"])) for row in rows(run_dir)]
@@ -48,11 +72,57 @@ def test_sheds_that_touch_have_disjoint_outlines_in_any_tiles(
 ) -> None:
     whole = reconstruct(sheds, settings={**TRUSTED, "tile_size_m": 1000.0})
     assert whole.statuses["ok"] == 4
-    assert max(overlaps_m2(whole.run_dir)) < 0.002  # a border's vertices are rounded to 1 mm
+    assert max(overlaps_m2(whole.run_dir)) < NOTHING_M2
     # borders of tiles between the sheds and through them
     for size_m, shift_m in ((30.0, 24.1), (24.0, 0.0), (41.5, 20.2)):
         tiles = {"tile_size_m": size_m, "lattice_x_m": shift_m, "lattice_y_m": shift_m}
         assert reconstruct(sheds, settings={**TRUSTED, **tiles}).digest == whole.digest
+
+
+@pytest.mark.parametrize(("seen_m", "touch"), [(3.0, True), (0.0, False), (None, False)])
+def test_a_slit_is_closed_where_something_but_no_ground_was_seen_in_it(
+    seen_m: float | None, touch: bool, tmp_path: Path, reconstruct: Callable[..., RunSummary]
+) -> None:
+    """Two houses half a metre apart; points in the slit lie so high above the ground, or there are none."""
+    random = np.random.default_rng(5)
+    x, y = random.uniform(0.0, 50.0, (2, 20_000))
+    z, kind = np.full(len(x), 50.0), np.full(len(x), 2, np.uint8)
+    for x0, y0, x1, y1, top in ((12.0, 12.0, 22.0, 20.0, 60.0), (22.9, 14.0, 30.0, 24.0, 56.0)):
+        inside = (x > x0) & (x < x1) & (y > y0) & (y < y1)
+        z[inside], kind[inside] = top, 6
+    slit = (x >= 22.0) & (x <= 22.9) & (y > 14.0) & (y < 20.0)
+    z[slit], kind[slit] = 50.0 + (seen_m or 0.0), 2 if seen_m == 0.0 else 1
+    keep = ~slit if seen_m is None else np.ones(len(x), np.bool_)
+    z += random.normal(0.0, 0.02, len(x))
+    found = Houses(xyz=np.column_stack((x + 4e5, y + 5.7e6, z))[keep], house=np.zeros(np.count_nonzero(keep), np.int8))
+    cloud = write_houses(tmp_path / "slit.laz", found, classes=kind[keep])
+    whole = reconstruct(cloud, settings={**TRUSTED, "tile_size_m": 1000.0})
+    outlines = [shapely.force_2d(shapely.from_wkb(row["geometry"])) for row in rows(whole.run_dir)]
+    assert len(outlines) == 2
+    assert (shapely.distance(*outlines) < 0.002) == touch
+    assert shapely.intersection(*outlines).area < 0.002
+    tiles = {"tile_size_m": 24.0, "lattice_x_m": 11.3, "lattice_y_m": 3.0}
+    assert reconstruct(cloud, settings={**TRUSTED, **tiles}).digest == whole.digest
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {},
+        {"roof": {"straight_eaves": False}},
+        {"method": "kmeans", "preset": "faithful"},
+        {"lods": "1.2"},
+    ],
+    ids=["arranged", "raw", "one form per building", "blocks"],
+)
+def test_models_of_a_town_do_not_overlap(
+    settings: dict[str, Any], town: Path, reconstruct: Callable[..., RunSummary]
+) -> None:
+    drawn = reconstruct(town, settings=TRUSTED | settings)
+    found = overlaps_m2(drawn.run_dir)
+    assert len(found) >= 15 * 14 // 2
+    assert sum(found) < NOTHING_M2
 
 
 def test_a_second_run_in_a_work_folder_draws_nothing_again(

@@ -180,10 +180,14 @@ def test_a_block_that_cannot_be_drawn_costs_only_its_outlines_and_is_reported(
         outlined(units, RoofSettings(), ONE_TILE, scratch)
 
 
-def test_raw_outlines_are_not_drawn_together(terrace: Terrace) -> None:
+def test_raw_outlines_are_drawn_together_too(terrace: Terrace) -> None:
     _, scratch, units = terrace
     alone = [dataclasses.replace(unit, outline=None) for unit in units]
-    assert outlined(alone, RoofSettings(straight_eaves=False), ONE_TILE, scratch) == (alone, [])
+    drawn, warnings = outlined(alone, RoofSettings(straight_eaves=False), ONE_TILE, scratch)
+    assert warnings == []
+    outlines = [unit.outline for unit in drawn]
+    assert all(outlines)
+    assert sum(shapely.intersection(a, b).area for a, b in itertools.combinations(outlines, 2)) < 1e-7
 
 
 def test_units_keep_every_point_once_in_the_tile_that_holds_it(row: npt.NDArray[np.void], tmp_path: Path) -> None:

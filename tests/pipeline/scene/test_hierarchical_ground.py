@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from whole_scene import seen_m, split_alone
+from whole_scene import seen_m, split_alone, terrain_of
 
-from pipeline.scene import WindowPoints, lattice_of, terrain_of
+from pipeline.scene import WindowPoints, lattice_of
 from pipeline.settings import RunSettings
 from pipeline.terrain.lattice import NO_DATA, height_above
 from pipeline.terrain.terrain_settings import (

@@ -320,6 +320,13 @@ def test_two_surfaces_across_a_step_join_where_both_are_like_roofs(
     assert leaders(surfaces_of([one, other, STEP_ROW], [(0, 2), (1, 2)])) == [*expected, -1]
 
 
+@pytest.mark.parametrize(("step", "leader"), [(9000, 0), (4900, -1)])
+def test_a_small_surface_of_class_6_joins_whatever_its_surroundings(step: int, leader: int) -> None:
+    part = {**DORMER, Sum.STEP: step, Sum.AREA2: 1_000_000, Sum.PLANAR: 0, Sum.ROUGH: 0}
+    kinds = [FacetKind.BUILDING, FacetKind.BUILDING, FacetKind.STEP]
+    assert leaders(surfaces_of([{}, part, STEP_ROW], [(0, 2), (1, 2)], kinds)) == [0, leader, -1]
+
+
 @pytest.mark.parametrize(
     ("rows", "along", "expected"),
     [

@@ -12,6 +12,7 @@ import roofs_by_hand as by_hand
 from las_files import write_las
 from roofs_by_hand import points_of
 from scipy import stats
+from whole_scene import terrain_of
 
 from pipeline.errors import InconsistentInputError
 from pipeline.model import BoolArray, FloatArray
@@ -28,7 +29,7 @@ from pipeline.ruler.evaluation.ground_scores import (
 from pipeline.ruler.evaluation.reference import Reference, ReferencePoints
 from pipeline.ruler.evaluation.reference_points import read_points_reference
 from pipeline.ruler.evaluation.subsets import Columns, subsets
-from pipeline.scene import WindowPoints, terrain_of
+from pipeline.scene import WindowPoints
 from pipeline.terrain.ground import ground_points
 from pipeline.terrain.terrain_settings import ClassesInUse, SceneSettings
 from pipeline.tiling import Window

@@ -1,0 +1,151 @@
+"""Slits between outlines of different candidates, closed where the two touch: each goes to one of them.
+
+Outlines are drawn one by one, and the points of a wall between two houses may belong to neither. What is closed
+follows from the outlines nearby alone, so two tasks decide alike. Everything is done in integer millimetres.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+import shapely
+from shapely import MultiPolygon, Polygon
+
+from pipeline.model import FloatArray
+from pipeline.roof.disjoint_outlines import effort
+from pipeline.roof.footprint import polygons_of
+
+GAP_MM = 1000.0
+"""Two outlines may leave a slit up to this width: an alley is wider."""
+_FACING_MM = 500.0
+"""A slit runs at least this far along both outlines."""
+_ROUNDING_MM = 1.5
+"""Corners that lie on an edge are within this of it."""
+_MITRE = 6.0
+"""Offset corners sharper than 20 degrees are cut."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Slit:
+    """An area between two outlines that face each other."""
+
+    area_mm: Polygon
+    """Integer millimetres."""
+    strips_mm: tuple[Polygon, Polygon]
+    """What the first, or the second, covers in addition if it moves its whole edge up to the other one."""
+
+
+def between(first_mm: MultiPolygon, second_mm: MultiPolygon) -> list[Polygon]:
+    """The areas that are less than `GAP_MM` wide between two outlines, integer millimetres."""
+    outlines = first_mm, second_mm
+    both, *alone = (_closed(area) for area in (shapely.union_all(outlines), *outlines))
+    areas = shapely.difference(both, shapely.union_all([*outlines, *alone], grid_size=1.0), grid_size=1.0)
+    return polygons_of(shapely.normalize(areas))
+
+
+def slits(
+    outlines: tuple[MultiPolygon, MultiPolygon],
+    areas: Sequence[Polygon],
+    within: shapely.Geometry,
+    third_mm: Sequence[MultiPolygon],
+    of_others: Sequence[Polygon],
+) -> list[Slit]:
+    """The slits of some areas between two outlines, apart from third outlines and from areas between other pairs."""
+    taken = shapely.union_all([*third_mm, *of_others], grid_size=1.0)
+    beside = shapely.buffer(shapely.union_all(third_mm), GAP_MM, join_style="mitre")
+    free = shapely.difference(within, shapely.union_all([beside, *of_others]))
+    found = []
+    for area in polygons_of(shapely.normalize(shapely.difference(MultiPolygon(list(areas)), taken, grid_size=1.0))):
+        if min(_common_mm(area, outline) for outline in outlines) < _FACING_MM or not shapely.covers(within, area):
+            continue
+        strips = [_strip(area, *pair) for pair in (outlines, outlines[::-1])]
+        mine, other = (strip if shapely.covers(free, strip) else area for strip in strips)
+        found.append(Slit(area_mm=area, strips_mm=(mine, other)))
+    return found
+
+
+def _strip(area: Polygon, own: MultiPolygon, other: MultiPolygon) -> Polygon:
+    """What an outline covers in addition if its edge beside a slit moves, parallel to itself, up to the other one."""
+    ring = shapely.get_coordinates(area.exterior)
+    edges = np.diff(ring, axis=0)
+    middles = shapely.points(0.5 * (ring[1:] + ring[:-1]))
+    lengths = np.hypot(edges[:, 0], edges[:, 1])
+    beside = np.where(shapely.dwithin(middles, own, _ROUNDING_MM), lengths, 0.0)
+    if not beside.any():
+        return area
+    along = edges[np.argmax(beside)] / beside.max()
+    # the slit lies to the right of its own ring, which runs clockwise
+    across = np.array([along[1], -along[0]])
+    offset = ring @ across
+    moved = np.rint(across * (offset.max() - offset.min()))
+    swept = shapely.union_all([shapely.transform(own, lambda xy: xy + moved), area], grid_size=1.0)
+    added = shapely.difference(swept, shapely.union_all([own, other], grid_size=1.0), grid_size=1.0)
+    place = shapely.point_on_surface(area)
+    return next((piece for piece in polygons_of(added) if shapely.intersects(piece, place)), area)
+
+
+def _closed(area: shapely.Geometry) -> shapely.Geometry:
+    """An area with what lies between parts of it that are less than `GAP_MM` apart."""
+    wide = shapely.buffer(area, 0.5 * GAP_MM, join_style="mitre", mitre_limit=_MITRE)
+    narrow = shapely.buffer(wide, -0.5 * GAP_MM, join_style="mitre", mitre_limit=_MITRE)
+    # a mitred offset can cross itself
+    return shapely.set_precision(shapely.make_valid(narrow, method="structure"), 1.0)
+
+
+def _common_mm(piece: Polygon, outline_mm: MultiPolygon) -> float:
+    """How far the border of a piece runs along an outline, within the rounding."""
+    beside = shapely.buffer(outline_mm, _ROUNDING_MM, join_style="mitre")
+    return float(shapely.length(shapely.intersection(piece.exterior, beside)))
+
+
+def closed(
+    first_mm: MultiPolygon, second_mm: MultiPolygon, found: Sequence[Slit]
+) -> tuple[list[Polygon], list[Polygon]]:
+    """What the first takes of the slits beside the second, and what the second takes.
+
+    It is what takes least to describe, then the least area.
+    """
+    taken: tuple[list[Polygon], list[Polygon]] = ([], [])
+    for number, slit in enumerate(found):
+        others = MultiPolygon([*taken[0], *taken[1], *(other.area_mm for other in found[number + 1 :])])
+        options = [(0, slit.area_mm), (1, slit.area_mm)]
+        options += [(side, strip) for side, strip in enumerate(slit.strips_mm) if not _overlap(strip, others)]
+        costs = []
+        for k, (side, area) in enumerate(options):
+            outline = (first_mm, second_mm)[side]
+            grown = shapely.union_all([outline, *taken[side], area], grid_size=1.0)
+            costs.append((effort(grown) - effort(outline), area.area, k))
+        side, area = options[min(costs)[2]]
+        taken[side].append(area)
+    return taken
+
+
+def without(area: Polygon, others: Sequence[shapely.Geometry]) -> list[Polygon]:
+    """An area apart from others by a millimetre, in integer millimetres."""
+    near = [other for other in others if shapely.dwithin(area, other, _ROUNDING_MM)]
+    if not near:
+        return [area]
+    wider = shapely.buffer(shapely.union_all(near, grid_size=1.0), _ROUNDING_MM, join_style="mitre")
+    return polygons_of(shapely.difference(area, wider, grid_size=1.0))
+
+
+def united(outline_mm: MultiPolygon, pieces: Sequence[Polygon]) -> MultiPolygon:
+    """An outline with what it takes, without the hairlines that rounding leaves between them."""
+    if not pieces:
+        return outline_mm
+    whole = shapely.union_all([outline_mm, *pieces])
+    for distance in (_ROUNDING_MM, -_ROUNDING_MM):
+        whole = shapely.buffer(whole, distance, join_style="mitre", mitre_limit=_MITRE)
+    return MultiPolygon(polygons_of(shapely.transform(whole, _near_grid)))
+
+
+def _near_grid(xy: FloatArray) -> FloatArray:
+    """Places with those coordinates rounded that offsets moved by less than a micrometre."""
+    rounded = np.rint(xy)
+    return np.where(np.abs(xy - rounded) < 1e-3, rounded, xy)
+
+
+def _overlap(area: Polygon, others: MultiPolygon) -> bool:
+    return bool(shapely.area(shapely.intersection(area, others)) > 0.0)

@@ -1,0 +1,155 @@
+"""Roof faces that lie exactly within an outline that other buildings touch, on the millimetre grid.
+
+New vertices on the outline are rounded to the grid, and vertices of the outline that bend its edges by a millimetre may
+be missing: then an edge of the faces leaves the outline by as much. Such vertices move to the nearest place inside, and
+edges take the outline's vertices beside them. Faces that reach far beyond the outline are cut.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections import Counter
+from itertools import pairwise
+
+import numpy as np
+import shapely
+from shapely import MultiPolygon, Polygon
+
+from pipeline.errors import BuildingError
+from pipeline.model import FloatArray, Reason
+from pipeline.roof.footprint import polygons_of
+from pipeline.roof.partition import RoofPartition
+
+_STEPS_MM = np.array(sorted(((x, y) for x in range(-2, 3) for y in range(-2, 3)), key=lambda xy: (math.hypot(*xy), xy)))
+"""Places around one on the grid, the nearest first."""
+_NEAR_MM = 2.9
+"""A vertex this near to one of the outline takes its place; an edge takes vertices of the outline this near to it."""
+_UNITED_MM = 10.0
+"""A corner of the outline that the faces lack takes the place of a vertex this near: faces unite such vertices."""
+_FAR_MM = 12.0
+_MOST_AREA_MM2 = 1e4
+"""Vertices farther outside do not move, unless so little lies outside: needles reach far, but hold little."""
+_ROUNDS = 4
+"""Most looks at it: an edge may need a second vertex once it has a first one."""
+_BACK_MM = 1.0
+"""What is cut ends this far inside: rounding to the grid moves it by up to 0.71 mm."""
+
+XY = tuple[float, float]
+
+
+def limit_in_mm(outline: MultiPolygon) -> MultiPolygon:
+    """An outline drawn with regard to others, in metres on the millimetre grid, in millimetres with every vertex.
+
+    Raises BuildingError `no_footprint` where others took all of it.
+    """
+    if outline.is_empty:
+        raise BuildingError(Reason.NO_FOOTPRINT, "others that touch it take all of its outline")
+    in_mm: MultiPolygon = shapely.transform(outline, lambda xy: np.rint(xy * 1e3))
+    return in_mm
+
+
+def within_outline(partition: RoofPartition, outline_mm: MultiPolygon) -> RoofPartition:
+    """A coverage in integer millimetres, within an outline; the same object if it was within.
+
+    Raises BuildingError `no_partition` where nothing lies within the outline.
+    """
+    shapely.prepare(outline_mm)
+    drawn: RoofPartition | None = partition
+    for _ in range(_ROUNDS):
+        if drawn is None:
+            break
+        if shapely.covers(outline_mm, drawn.polygons).all():
+            return drawn
+        drawn = _fitted(drawn, outline_mm)
+    return _cut(partition, outline_mm)
+
+
+def _fitted(partition: RoofPartition, outline_mm: MultiPolygon) -> RoofPartition | None:
+    """A coverage with vertices moved into the outline and its own inserted; None where faces break, or reach far."""
+    polygons = np.array(partition.polygons, dtype=object)
+    xy = np.unique(shapely.get_coordinates(polygons), axis=0)
+    corners = np.unique(shapely.get_coordinates(outline_mm), axis=0)
+    corners = corners[(corners == np.rint(corners)).all(axis=1)]
+    tree = shapely.STRtree(shapely.points(corners))
+    moved = _places(xy, corners, tree)
+    outside = xy[~shapely.intersects_xy(outline_mm, xy[:, 0], xy[:, 1])]
+    points = shapely.points(outside)
+    ways = shapely.shortest_line(outline_mm, points)
+    is_far = (shapely.length(ways) > _FAR_MM).any()
+    if is_far and shapely.area(shapely.difference(polygons, outline_mm)).sum() > _MOST_AREA_MM2:
+        return None
+    for place, way in zip(map(tuple, outside.tolist()), ways.tolist(), strict=True):
+        tried = np.rint(way.coords[0]) + _STEPS_MM
+        tried = tried[shapely.intersects_xy(outline_mm, tried[:, 0], tried[:, 1])]
+        if place not in moved and len(tried):
+            moved[place] = tuple(tried[0].tolist())
+    rings = [[_moved(ring, moved) for ring in shapely.get_rings(polygon).tolist()] for polygon in polygons.tolist()]
+    edges = Counter(frozenset(edge) for own in rings for ring in own for edge in pairwise(ring))
+    lines = shapely.linestrings([sorted(edge) for edge, times in edges.items() if times == 1])
+    between: dict[frozenset[XY], list[XY]] = {}
+    for line in lines[~shapely.covers(outline_mm, lines)].tolist():
+        near = corners[tree.query(line, predicate="dwithin", distance=_NEAR_MM)]
+        along = {tuple(corner): line.project(shapely.Point(corner)) for corner in near.tolist()}
+        inner = {corner: way for corner, way in along.items() if 0.0 < way < line.length}
+        a, b = line.coords
+        between[frozenset((a, b))] = [a, *sorted(inner, key=lambda corner: inner[corner]), b]
+    longer = [[_with_corners(ring, between) for ring in own] for own in rings]
+    left = [k for k, own in enumerate(longer) if len(own[0]) > 3]
+    fitted = tuple(Polygon(longer[k][0], [hole for hole in longer[k][1:] if len(hole) > 3]) for k in left)
+    if not fitted or not (shapely.is_valid(fitted).all() and shapely.coverage_is_valid(fitted)):
+        return None
+    return dataclasses.replace(partition, polygons=fitted, labels=partition.labels[left])
+
+
+def _places(xy: FloatArray, corners: FloatArray, tree: shapely.STRtree) -> dict[XY, XY]:
+    """Vertices (n, 2) that take the place of a corner of the outline, and that place."""
+    known = set(map(tuple, xy.tolist()))
+    near, at = tree.query_nearest(shapely.points(xy), max_distance=_UNITED_MM, all_matches=False)
+    return {
+        tuple(vertex): tuple(corner)
+        for vertex, corner in zip(xy[near].tolist(), corners[at].tolist(), strict=True)
+        if tuple(corner) not in known or math.dist(vertex, corner) <= _NEAR_MM
+    }
+
+
+def _moved(ring: shapely.LinearRing, moved: dict[XY, XY]) -> list[XY]:
+    """The vertices of a ring where they moved to, closed; none twice in a row, and none to which it returns at once."""
+    places: list[XY] = []
+    for x, y in ring.coords[:-1]:
+        place = moved.get((x, y), (x, y))
+        if place in places[-2:-1]:
+            places.pop()
+        elif place not in places[-1:]:
+            places.append(place)
+    while len(places) > 2 and (places[0] == places[-1] or places[1] == places[-1] or places[0] == places[-2]):
+        places = places[1:] if places[1] == places[-1] else places[:-1]
+    return [*places, places[0]]
+
+
+def _with_corners(ring: list[XY], between: dict[frozenset[XY], list[XY]]) -> list[XY]:
+    """A closed ring with the vertices that some of its edges, by their ends, take."""
+    longer = ring[:1]
+    for a, b in pairwise(ring):
+        path = between.get(frozenset((a, b)), [a, b])
+        longer += path[1:] if path[0] == a else path[-2::-1]
+    return longer
+
+
+def _cut(partition: RoofPartition, outline_mm: MultiPolygon) -> RoofPartition:
+    """The part of a coverage that lies inside an outline by a few millimetres."""
+    inner = shapely.buffer(outline_mm, -_BACK_MM, join_style="mitre")
+    net = shapely.union_all(shapely.boundary([*partition.polygons, inner]), grid_size=1.0)
+    cells = np.array(polygons_of(shapely.polygonize(shapely.get_parts(net))), dtype=object)
+    places = shapely.point_on_surface(cells)
+    inside = shapely.contains(inner, places)
+    polygons: list[Polygon] = []
+    labels: list[int] = []
+    for polygon, label in zip(partition.polygons, partition.labels.tolist(), strict=True):
+        own = cells[inside & shapely.contains(polygon, places)]
+        pieces = polygons_of(shapely.coverage_union_all(own)) if len(own) else []
+        polygons += pieces
+        labels += [label] * len(pieces)
+    if not polygons or not shapely.covers(outline_mm, polygons).all():
+        raise BuildingError(Reason.NO_PARTITION, "the roof faces leave the outline that others touch")
+    return dataclasses.replace(partition, polygons=tuple(polygons), labels=np.array(labels, np.int32))
