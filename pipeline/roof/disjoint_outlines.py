@@ -82,16 +82,15 @@ def divided(first: Claim, second: Claim) -> tuple[MultiPolygon, MultiPolygon]:
         mine, theirs = ([piece], []) if piece.area < _SMALL_MM2 else _shares(piece, first, second)
         to_first += mine
         to_second += theirs
-    net = shapely.union_all(
-        shapely.boundary([first.outline_mm, second.outline_mm, *to_first, *to_second]), grid_size=1.0
-    )
+    drawn = [first.outline_mm, second.outline_mm, *to_first, *to_second]
+    net = shapely.union_all(shapely.boundary(drawn), grid_size=1.0)
     cells = np.array(polygons_of(shapely.polygonize(shapely.get_parts(net))), dtype=object)
     places = shapely.point_on_surface(cells)
     is_first = shapely.intersects(first.outline_mm, places)
     is_second = shapely.intersects(second.outline_mm, places)
-    is_second &= ~shapely.intersects(shapely.union_all(to_first), places)
     is_first &= ~shapely.intersects(shapely.union_all(to_second), places)
-    kept, left = (_united(cells[chosen]) for chosen in (is_first, is_second & ~is_first))
+    is_second &= ~(is_first | shapely.intersects(shapely.union_all(to_first), places))
+    kept, left = (_united(cells[chosen]) for chosen in (is_first, is_second))
     return kept, left
 
 
@@ -114,9 +113,9 @@ def _shares(piece: Polygon, first: Claim, second: Claim) -> tuple[list[Polygon],
     least, best = math.inf, (none, none)
     for mine, theirs, wrong in options:
         cost = _WRONG_COST * wrong
-        for claim, lost, as_drawn in ((first, theirs, whole[0]), (second, mine, whole[1])):
+        for claim, lost, as_it_is in ((first, theirs, whole[0]), (second, mine, whole[1])):
             if not lost:
-                cost += as_drawn
+                cost += as_it_is
             elif cost < least:
                 left = shapely.difference(claim.outline_mm, MultiPolygon(lost), grid_size=1.0)
                 cost += effort(left) + (_BARRED if left.area < _KEPT_SHARE * claim.outline_mm.area else 0.0)

@@ -99,6 +99,17 @@ def _turns(directions: FloatArray, prices: Prices) -> FloatArray:
 
 
 @kernel(inline="always")
+def _end_price(angle: float, is_first: bool, is_last: bool, met: FloatArray, prices: Prices) -> float:
+    """The price of the ends of an edge on the lines that the description begins and ends on, which have two sides."""
+    price = 0.0
+    for k in range(2):
+        if is_first if k == 0 else is_last:
+            turn = angle - met[k]
+            price += _turn_price(-abs(math.cos(turn)), math.sin(turn), prices)  # no price if it is nan
+    return price
+
+
+@kernel(inline="always")
 def _own_direction(moments: tuple[float, float, float], cx: float, cy: float) -> tuple[float, float]:
     """The angle of the line through a stretch with moments xx, xy and yy, and how far its chord goes along it."""
     sxx, sxy, syy = moments
@@ -115,17 +126,6 @@ def _turn(best: FloatArray, turns: FloatArray, before: FloatArray, through: IntA
             total = best[a] + turns[a, b]
             if total < before[b]:
                 before[b], through[b] = total, a
-
-
-@kernel(inline="always")
-def _end_price(angle: float, is_first: bool, is_last: bool, met: FloatArray, prices: Prices) -> float:
-    """The price of the ends of an edge on the lines that the description begins and ends on, which have two sides."""
-    price = 0.0
-    for k in range(2):
-        if is_first if k == 0 else is_last:
-            turn = angle - met[k]
-            price += _turn_price(-abs(math.cos(turn)), math.sin(turn), prices)  # no price if it is nan
-    return price
 
 
 @kernel
