@@ -151,7 +151,7 @@ def _evenness(outline_mm: MultiPolygon, points: EdgePoints | None) -> float:
         return 1.0
     # neighbours are missed at borders, so few points seem to lie farther apart than they do
     spacing_mm = min(points.spacing_mm, math.sqrt(outline_mm.area / len(points.xy_mm)))
-    return min(max(points.nearest_mm / (_NEAREST * spacing_mm), 1.0), _EVENEST) ** _EVEN_POWER
+    return math.pow(min(max(points.nearest_mm / (_NEAREST * spacing_mm), 1.0), _EVENEST), _EVEN_POWER)
 
 
 def _of_few_points(border: FloatArray, spacing_m: float, points: EdgePoints, noise_mm: float) -> FloatArray | None:
