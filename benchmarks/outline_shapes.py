@@ -71,7 +71,8 @@ class Judged:
 
 def edges_of(outline: shapely.Geometry) -> FloatArray:
     """The edges (n, 2, 2) of an area, which is on their left."""
-    rings = map(shapely.get_coordinates, shapely.get_rings(shapely.orient_polygons(shapely.force_2d(outline))))
+    oriented = shapely.orient_polygons(shapely.force_2d(outline))
+    rings = map(shapely.get_coordinates, shapely.get_rings(shapely.get_parts(oriented)))
     return np.concatenate([np.stack([ring[:-1], ring[1:]], axis=1) for ring in rings])
 
 
@@ -94,8 +95,8 @@ def nearest(places: FloatArray, way: FloatArray, edges: FloatArray, most_deg: fl
 
 def corners_of(outline: shapely.Geometry) -> FloatArray:
     """Corners (n, 2) that turn by more than `TURN_DEG`."""
-    found = [np.zeros((0, 2))]
-    for ring in map(shapely.get_coordinates, shapely.get_rings(shapely.simplify(outline, STRAIGHT_M))):
+    found, simple = [np.zeros((0, 2))], shapely.simplify(outline, STRAIGHT_M)
+    for ring in map(shapely.get_coordinates, shapely.get_rings(shapely.get_parts(simple))):
         along = np.diff(ring, axis=0)
         along /= np.hypot(*along.T)[:, None]
         found.append(ring[:-1][np.sum(along * np.roll(along, 1, axis=0), axis=1) < math.cos(math.radians(TURN_DEG))])

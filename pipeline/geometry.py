@@ -231,6 +231,11 @@ def spacing_over_area_m(points: FloatArray) -> float:
     return over_area if over_area > _UNEVEN * usual else usual
 
 
+def nearest_distance(points: FloatArray) -> float:
+    """Median distance of points (n, 2), n > 0, from the nearest other one; infinite for a single one."""
+    return math.sqrt(float(np.median(_nearest_neighbours(points, 1, 0.0, False)[1])))
+
+
 def _plan(points: FloatArray) -> bytes:
     """Positions in plan, (n, 2) float64."""
     return np.ascontiguousarray(points[:, :2], dtype=np.float64).tobytes()

@@ -9,6 +9,7 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+import shapely
 
 from pipeline.model import FloatArray, ModelQuality, Plane, RoofFace, Solid
 from pipeline.quality.residuals import ResidualSummary, TopSurface, summarise, surface_of
@@ -21,21 +22,23 @@ GAP_SPACINGS = 1.5
 """A place farther than this from all points is seen by none: of points strewn at random one place in a thousand is."""
 EXTRAPOLATED_SPACINGS = 2.0
 """A part of the roof farther than this from all points was drawn by what lies beside it, and by the footprint."""
-_OUTLINE_PER_SPACING, _LEAST_OUTLINE_M = 0.2, 0.02
-"""Standard deviation of drawn outlines: of the suite `outline_shapes` (dev), 0.3 to 8 points per m2."""
+_STRIP_POINTS, _LEAST_OUTLINE_M = 1.7, 0.02
+"""The place of an edge is known to the strip along it that holds so many points (`outline_shapes`, dev seeds)."""
 _MIN_CELL_M = 0.25
 """Places on the roof are looked at on a raster of one point spacing, or of this where points are denser."""
 _MAX_CELLS = 20_000
 """Halls of more cells are looked at more coarsely."""
 
 
-def drawn_outline_sigma_m(spacing_m: float) -> float:
-    """Standard deviation in plan of the edges of a drawn outline, metres: it grows with the area per point.
+def drawn_outline_sigma_m(outline: shapely.Geometry, n_points: int) -> float:
+    """Standard deviation in plan of the edges of an outline drawn around points, metres; an area of metres.
 
-    >>> [round(drawn_outline_sigma_m(density**-0.5), 2) for density in (0.3, 1.5, 8.0)]
-    [0.67, 0.13, 0.03]
+    >>> [round(drawn_outline_sigma_m(shapely.box(0, 0, 10, 10), n), 2) for n in (30, 150, 800)]
+    [0.57, 0.12, 0.03]
     """
-    return math.hypot(_OUTLINE_PER_SPACING * spacing_m**2, _LEAST_OUTLINE_M)
+    rings = shapely.get_rings(shapely.get_parts(shapely.simplify(outline, 0.01)))
+    edge_m = shapely.length(rings).sum() / (shapely.get_num_coordinates(rings) - 1).sum()
+    return math.hypot(_STRIP_POINTS * outline.area / n_points / edge_m, _LEAST_OUTLINE_M)
 
 
 def model_quality(

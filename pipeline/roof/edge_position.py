@@ -23,7 +23,7 @@ import numpy as np
 import shapely
 
 from pipeline.compiler import kernel
-from pipeline.geometry import bounds_of
+from pipeline.geometry import bounds_of, nearest_distance
 from pipeline.kernels.exact_sum import exact_sum
 from pipeline.kernels.sorting import counting_sort, in_order, sort_few
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
@@ -93,6 +93,8 @@ class EdgePoints:
     """Side of a cell."""
     spacing_mm: float
     """Typical distance of neighbours."""
+    nearest_mm: float
+    """Median distance from the nearest point."""
 
     @classmethod
     def of(cls, xy_mm: IntArray, split: BoolArray, spacing_m: float) -> EdgePoints:
@@ -114,6 +116,7 @@ class EdgePoints:
             rows=rows,
             cell_mm=cell,
             spacing_mm=spacing_m * 1e3,
+            nearest_mm=nearest_distance(np.ascontiguousarray(xy_mm, dtype=np.float64)),
         )
 
     @property

@@ -108,8 +108,9 @@ class RoofSettings(Parameters):
         True, "Whether the outline is drawn with straight lines where no footprint is given."
     )
     outline_noise_spacings: float = parameter(
-        0.35,
-        "Standard deviation of the raw outline about its edges: with less, the outline gets more edges.",
+        0.4,
+        "Standard deviation of the raw outline about its edges, for points at random: with less, the outline gets more"
+        " edges.",
         unit="point spacings",
         minimum=0.05,
         maximum=2.0,

@@ -26,6 +26,13 @@ def test_houses_of_a_row_are_held_against_their_block() -> None:
     assert (found.iou, found.right, found.found) == (pytest.approx(1.0), 4, 4)
 
 
+def test_an_outline_of_parts_shows_the_edges_and_corners_of_all() -> None:
+    parts = shapely.MultiPolygon([HOUSE, shapely.box(20.0, 0.0, 24.0, 6.0)])
+    found = judged(HOUSE, [parts], [0.1], per_m2=4.0)
+    assert (found.right, found.found, len(corners_of(parts))) == (4, 8, 8)
+    assert [edge[1] for edge in found.edges] == pytest.approx([0.0] * 4, abs=1e-9)
+
+
 def test_distances_are_positive_outwards_and_taken_from_the_nearest_parallel_edge() -> None:
     found = judged(HOUSE, [shapely.box(-0.3, 0.0, 10.0, 5.8)], [0.25], per_m2=4.0)
     distances = sorted(edge[1] for edge in found.edges)

@@ -51,6 +51,22 @@ def test_a_ragged_rectangle_becomes_a_rectangle(turn_deg: float) -> None:
         assert abs(math.remainder(b - a, math.tau)) == pytest.approx(math.pi / 2, abs=1e-3)
 
 
+def test_evenly_spread_points_show_an_oblique_wall_that_points_at_random_do_not() -> None:
+    truth = Polygon([(0, 0), (12.5, 0), (10, 8), (0, 8)])
+    raw = MultiPolygon([Polygon(np.rint(shapely.get_coordinates(shapely.segmentize(truth, 0.7)) * 1e3))])
+    lattice = 1.5 * np.stack(np.meshgrid(np.arange(8), np.arange(6)), axis=-1).reshape(-1, 2) + 0.4
+    at_random = np.random.default_rng(4).uniform((0, 0), (11.5, 8), lattice.shape)
+    corners = {}
+    for name, xy in (("even", lattice), ("at random", at_random)):
+        inside = np.rint(xy[shapely.contains_xy(truth, xy)] * 1e3).astype(np.int64)
+        points = EdgePoints.of(inside, np.zeros(len(inside), np.bool_), 1.5)
+        (drawn,) = straighten(raw, 1.5, SETTINGS, points).geoms
+        sides = np.diff(shapely.get_coordinates(drawn.exterior), axis=0)
+        turns = np.degrees(np.arctan2(sides[:, 1], sides[:, 0])) % 90
+        corners[name] = float(np.abs((turns - turns[0] + 45) % 90 - 45).max())
+    assert corners["even"] > 10 > 1 > corners["at random"]
+
+
 def test_a_ragged_l_keeps_its_inner_corner() -> None:
     truth = shapely.union_all([shapely.box(0, 0, 16, 6), shapely.box(0, 0, 6, 14)])
     drawn = straighten(ragged(truth, 0.4, np.random.default_rng(1)), 0.4, SETTINGS)
