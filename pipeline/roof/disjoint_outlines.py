@@ -233,20 +233,42 @@ def _is_needle(part: Polygon) -> bool:
 
 
 def _without_short_edges(polygon: Polygon) -> Polygon:
-    """A polygon without edges that a solid cannot have: the corner at one end is cut off where that adds nothing."""
+    """A polygon without edges that a solid cannot have, where that adds nothing."""
     rings = [_thinned(shapely.get_coordinates(ring)[:-1]) for ring in shapely.get_rings(polygon.normalize()).tolist()]
     thinned = Polygon(rings[0], rings[1:])
     return thinned if thinned.is_valid else polygon
 
 
 def _thinned(ring: FloatArray) -> FloatArray:
-    """A ring (n, 2) with the area to its right, without the corners whose removal shortens it at a short edge."""
+    """A ring (n, 2) with the area to its right, without short edges.
+
+    A corner at one end is cut off. Where both are inner corners, the edges beside it are continued to where they meet.
+    """
     while len(ring) > 4:
         into, out = ring - np.roll(ring, 1, axis=0), np.roll(ring, -1, axis=0) - ring
         cut_off = into[:, 1] * out[:, 0] - into[:, 0] * out[:, 1]
         short = np.hypot(out[:, 0], out[:, 1]) < _SHORTEST_MM
         free = (short | np.roll(short, 1)) & (cut_off >= 0.0)
-        if not free.any():
+        if free.any():
+            ring = np.delete(ring, int(np.argmin(np.where(free, cut_off, np.inf))), axis=0)
+            continue
+        met = [_meeting(ring, k) for k in np.flatnonzero(short).tolist()]
+        k, place = next(
+            ((k, place) for k, place in zip(np.flatnonzero(short), met, strict=True) if len(place)), (0, ())
+        )
+        if not len(place):
             break
-        ring = np.delete(ring, int(np.argmin(np.where(free, cut_off, np.inf))), axis=0)
+        ring = np.roll(ring, -k, axis=0)
+        ring = np.concatenate(([place], ring[2:]))
     return ring
+
+
+def _meeting(ring: FloatArray, k: int) -> FloatArray:
+    """Where the edges beside edge k meet if they are continued, (2,); empty if that is not near."""
+    a, b, c, d = np.take(ring, range(k - 1, k + 3), axis=0, mode="wrap")
+    (ux, uy), (vx, vy), (wx, wy) = b - a, c - d, d - a
+    det = ux * vy - uy * vx
+    if det == 0.0:
+        return np.empty(0)
+    place = a + (wx * vy - wy * vx) / det * (b - a)
+    return place if max(math.dist(place, b), math.dist(place, c)) < _SHORTEST_MM else np.empty(0)

@@ -25,8 +25,10 @@ _ROUNDING_MM = 1.5
 """Corners that lie on an edge are within this of it."""
 _APART_MM, _MARGIN_MM = 2.0, 1.2
 """What is taken keeps so far away from others, and a margin around it is narrower, after rounding, too."""
-_MITRE = 6.0
-"""Offset corners sharper than 20 degrees are cut."""
+_MITRE = 1.5
+"""Offset corners sharper than 84 degrees are cut: areas between outlines lie within three quarters of the gap."""
+_SHARP_MITRE = 10.0
+"""The same at hairlines and margins: 12 degrees."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -57,7 +59,8 @@ def slits(
     """The slits of some areas between two outlines, apart from third outlines and from areas between other pairs."""
     taken = shapely.union_all([*third_mm, *of_others], grid_size=1.0)
     beside = shapely.buffer(shapely.union_all(third_mm), GAP_MM, join_style="mitre")
-    free = shapely.difference(within, shapely.union_all([beside, *of_others]))
+    margin = shapely.buffer(list(of_others), _APART_MM, join_style="mitre")
+    free = shapely.difference(within, shapely.union_all([beside, *margin]))
     found = []
     for area in polygons_of(shapely.normalize(shapely.difference(MultiPolygon(list(areas)), taken, grid_size=1.0))):
         if min(_common_mm(area, outline) for outline in outlines) < _FACING_MM or not shapely.covers(within, area):
@@ -139,7 +142,7 @@ def united(outline_mm: MultiPolygon, pieces: Sequence[Polygon]) -> MultiPolygon:
         return outline_mm
     whole = shapely.union_all([outline_mm, *pieces])
     for distance in (_ROUNDING_MM, -_ROUNDING_MM):
-        whole = shapely.buffer(whole, distance, join_style="mitre", mitre_limit=_MITRE)
+        whole = shapely.buffer(whole, distance, join_style="mitre", mitre_limit=_SHARP_MITRE)
     return MultiPolygon(polygons_of(shapely.transform(whole, _near_grid)))
 
 
@@ -150,7 +153,7 @@ def widened(kept_mm: MultiPolygon, pieces: Sequence[Polygon]) -> MultiPolygon:
     """
     if not pieces:
         return kept_mm
-    wider = shapely.buffer(pieces, _MARGIN_MM, join_style="mitre", mitre_limit=_MITRE)
+    wider = shapely.buffer(pieces, _MARGIN_MM, join_style="mitre", mitre_limit=_SHARP_MITRE)
     return MultiPolygon(polygons_of(shapely.union_all([kept_mm, *wider])))
 
 

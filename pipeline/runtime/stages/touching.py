@@ -165,15 +165,19 @@ def _outlines_of(
     What fails without a known reason leaves its candidates as they are drawn alone, with a warning.
     """
     all_pairs = near_pairs(sites)
+    compared = set(all_pairs[all_pairs[:, 0] < owned].ravel().tolist())
+    # units of a block that others own are not compared with its own ones, but may lie beside what is
+    blocks = {site.block for site in sites[:owned]} - {None}
+    compared |= {k for k, site in enumerate(sites) if site.outline is not None and site.block in blocks}
     drawn: dict[int, MultiPolygon] = {}
-    for k in np.unique(all_pairs[all_pairs[:, 0] < owned]).tolist():
+    for k in sorted(compared):
         task.scratch.check_cancelled()
         outline_mm = _or_warned(warnings, (sites[k],), functools.partial(_drawn_mm, sites[k], task))
         if outline_mm is not None:
             drawn[k] = outline_mm
     all_pairs = np.array([(i, j) for i, j in all_pairs.tolist() if i in drawn and j in drawn], np.int64).reshape(-1, 2)
     first, second = (np.array([drawn[k] for k in column.tolist()], object) for column in all_pairs.T)
-    taken = _taken(all_pairs[shapely.dwithin(first, second, GAP_MM)].tolist(), sites, drawn, task, warnings)
+    taken = _taken(all_pairs[shapely.dwithin(first, second, GAP_MM)].tolist(), sites, owned, drawn, task, warnings)
     is_own = all_pairs[:, 0] < owned
     near = all_pairs[is_own & shapely.dwithin(first, second, _BESIDE_MM)]
     close = all_pairs[is_own & shapely.dwithin(first, second, _CLOSE_MM)]
@@ -215,29 +219,34 @@ def _outlines_of(
 def _taken(
     pairs: Sequence[Sequence[int]],
     sites: Sequence[CandidateSite],
+    owned: int,
     drawn: Mapping[int, MultiPolygon],
     task: TouchTask,
     warnings: list[str],
 ) -> dict[tuple[int, int], list[shapely.Polygon]]:
     """What the first of two candidates takes of the slits beside the second, and the second beside the first.
 
-    It keeps a millimetre away from third outlines, and from what others take.
+    It keeps away from third outlines, and from the areas between others.
     """
+    ordered = [(j, i) if sites[j].building_id < sites[i].building_id else (i, j) for i, j in pairs]
+    around = {}
+    for i, j in ordered:
+        areas = functools.partial(between, drawn[i], drawn[j])
+        around[i, j] = _or_warned(warnings, (sites[i], sites[j]), areas) or []
     taken: dict[tuple[int, int], list[shapely.Polygon]] = {}
-    for (i, j), found in _slits(pairs, sites, drawn, task, warnings).items():
-        if found:
-            parts = _or_warned(warnings, (sites[i], sites[j]), functools.partial(closed, drawn[i], drawn[j], found))
-            taken[i, j], taken[j, i] = parts or ([], [])
-    apart = {}
-    for (k, j), pieces in taken.items():
-        others = [outline for m, outline in drawn.items() if m not in (k, j)]
-        others += [piece for (m, _), of_other in taken.items() if m != k for piece in of_other]
-        apart[k, j] = [part for piece in pieces for part in without(piece, others)]
-    return apart
+    own = [pair for pair in around if min(pair) < owned and around[pair]]
+    for (i, j), found in _slits(own, around, sites, drawn, task, warnings).items():
+        parts = _or_warned(warnings, (sites[i], sites[j]), functools.partial(closed, drawn[i], drawn[j], found))
+        for k, other, pieces in zip((i, j), (j, i), parts or ([], []), strict=True):
+            beside = [outline for m, outline in drawn.items() if m not in (i, j)]
+            beside += [area for pair, areas in around.items() if k not in pair for area in areas]
+            taken[k, other] = [part for piece in pieces for part in without(piece, beside)]
+    return taken
 
 
 def _slits(
-    pairs: Sequence[Sequence[int]],
+    pairs: Sequence[tuple[int, int]],
+    around: Mapping[tuple[int, int], Sequence[shapely.Polygon]],
     sites: Sequence[CandidateSite],
     drawn: Mapping[int, MultiPolygon],
     task: TouchTask,
@@ -245,30 +254,23 @@ def _slits(
 ) -> dict[tuple[int, int], list[Slit]]:
     """The slits between pairs of outlines that a wall or a roof fills, by pair: points lie in them, but no ground.
 
-    Those narrower than the point spacing may be empty. A task knows all outlines that reach into the boxes of both, so
-    another task finds the same slits.
+    Those narrower than the point spacing may be empty. `around` are the areas between the outlines of all pairs. A task
+    knows all outlines that reach into the boxes of both, so another task finds the same slits.
     """
-    ordered = [(j, i) if sites[j].building_id < sites[i].building_id else (i, j) for i, j in pairs]
 
     def of_pair(i: int, j: int) -> list[Slit]:
-        if not around[i, j]:
-            return []
         known = shapely.intersection(*(shapely.box(*(sites[k].reach_mm or ())) for k in (i, j)))
         third = [outline for k, outline in drawn.items() if k not in (i, j) and outline.intersects(known)]
         others = [area for pair, areas in around.items() if pair != (i, j) for area in areas if area.intersects(known)]
         return slits((drawn[i], drawn[j]), around[i, j], shapely.buffer(known, -GAP_MM), third, others)
 
-    around = {}
-    for i, j in ordered:
-        areas = functools.partial(between, drawn[i], drawn[j])
-        around[i, j] = _or_warned(warnings, (sites[i], sites[j]), areas) or []
     found = {}
-    for i, j in ordered:
+    for i, j in pairs:
         found[i, j] = _or_warned(warnings, (sites[i], sites[j]), functools.partial(of_pair, i, j)) or []
-    areas_mm = [slit.area_mm for pair in ordered for slit in found[pair]]
+    areas_mm = [slit.area_mm for pair in pairs for slit in found[pair]]
     heights = iter(_heights_in(areas_mm, task) if areas_mm else ())
     return {
-        pair: [slit for slit in found[pair] if _is_built(slit, next(heights), pair, sites, drawn)] for pair in ordered
+        pair: [slit for slit in found[pair] if _is_built(slit, next(heights), pair, sites, drawn)] for pair in pairs
     }
 
 
