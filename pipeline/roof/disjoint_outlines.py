@@ -47,6 +47,8 @@ _NEEDLE_MM = 120.0
 """Half the width of a part that is not left of an outline: no wing of a house is as narrow."""
 _SHORTEST_MM = 20.0
 """Corners nearer to each other are united when a solid is made, which would move a common border."""
+_PLAIN_MM = 3.0
+"""Corners that rounding and crossings leave lie within this of plain edges."""
 _MITRE = 6.0
 """Offset corners sharper than 20 degrees are cut."""
 
@@ -200,7 +202,7 @@ def left_of(outline_mm: MultiPolygon, kept: Iterable[MultiPolygon], min_area_m2:
     limits = sorted({shape.wkb: shape for shape in kept}.items())
     left = functools.reduce(shapely.intersection, (shape for _, shape in limits)) if limits else outline_mm
     own = [_without_short_edges(part) for polygon in polygons_of(left) for part in _without_needles(polygon)]
-    within = [part for polygon in own for part in _on_grid_within(polygon, left)]
+    within = [_plain(part, left) for polygon in own for part in _on_grid_within(polygon, left)]
     large = [polygon for polygon in within if polygon.area >= min_area_m2 * 1e6]
     large = large or sorted(within, key=lambda polygon: (polygon.area, polygon.bounds))[-1:]
     # the order of the pieces decides where rings begin
@@ -217,6 +219,24 @@ def _on_grid_within(polygon: Polygon, limit: shapely.Geometry) -> list[Polygon]:
         return list(within_outline(faces, MultiPolygon(polygons_of(limit))).polygons)
     except BuildingError:
         return []
+
+
+def _plain(polygon: Polygon, limit: shapely.Geometry) -> Polygon:
+    """A polygon without short edges, millimetres farther inside where that takes it; as it is where nothing helps."""
+    if not _has_short_edges(polygon):
+        return polygon
+    plain = shapely.simplify(polygon, _PLAIN_MM)
+    for back_mm in (0.0, 1.0, 2.0, _PLAIN_MM + 1.0):
+        inner = shapely.buffer(plain, -back_mm, join_style="mitre", mitre_limit=_MITRE)
+        tried = polygons_of(shapely.set_precision(inner, 1.0))
+        if len(tried) == 1 and not _has_short_edges(tried[0]) and shapely.covers(limit, tried[0]):
+            return tried[0]
+    return polygon
+
+
+def _has_short_edges(polygon: Polygon) -> bool:
+    lines = [np.diff(shapely.get_coordinates(ring), axis=0) for ring in shapely.get_rings(polygon).tolist()]
+    return bool((np.hypot(*np.concatenate(lines).T) < _SHORTEST_MM).any())
 
 
 def _without_needles(polygon: Polygon) -> list[Polygon]:

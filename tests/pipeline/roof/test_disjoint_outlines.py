@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from shapely import MultiPolygon, Polygon
 from shapely.affinity import rotate
 
-from pipeline.roof.disjoint_outlines import Claim, divided, left_of
+from pipeline.roof.disjoint_outlines import Claim, _thinned, divided, left_of
 
 CORNER_MM = np.array([84_900_000, 447_500_000])
 
@@ -175,3 +175,11 @@ def test_outlines_are_disjoint_within_what_they_covered_in_any_order(
     for one, before in zip(outlines, claims, strict=True):
         assert shapely.difference(one, shapely.buffer(before.outline_mm, 1.5)).is_empty
     assert overlap_m2(outlines) == pytest.approx(0.0, abs=1e-7)
+
+
+def test_a_short_edge_between_two_inner_corners_goes_and_nothing_is_added() -> None:
+    ring = np.array([(0, 0), (0, 4000), (1000, 4000), (2000, 2001), (2001, 2000), (4000, 1000), (4000, 0)], np.float64)
+    thinned = _thinned(ring)
+    assert len(thinned) == 6
+    assert Polygon(ring).buffer(1e-6).covers(Polygon(thinned))
+    assert Polygon(ring).area - Polygon(thinned).area < 5.0
