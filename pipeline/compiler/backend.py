@@ -41,7 +41,6 @@ COMMON_OPTIONS = {"nopython": True, "nogil": True}
 config.CPU_NAME = processor()
 if config.CPU_NAME == PORTABLE:
     config.CPU_FEATURES = ""
-_ENVIRONMENTS = "_ZN08NumbaEnv"
 _PLAIN = "GABLEWORK_PLAIN_NUMBA"
 
 

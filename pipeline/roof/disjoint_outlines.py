@@ -12,7 +12,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import shapely
@@ -109,11 +109,11 @@ def _shares(piece: Polygon, first: Claim, second: Claim) -> tuple[list[Polygon],
     options = [([piece], none, len(other)), (none, [piece], len(own))]
     if min(len(own), len(other)) >= _FEWEST_WRONG:
         options.extend(_chords(piece, own, other))
-    options.extend((taken, none, wrong) for taken, wrong in _retreats(piece, second))
-    options.extend((none, taken, wrong) for taken, wrong in _retreats(piece, first))
-    whole = [effort(claim.outline_mm) for claim in (first, second)]
-    least, best = math.inf, (none, none)
-    for mine, theirs, wrong in options:
+    whole = effort(first.outline_mm), effort(second.outline_mm)
+    least, best = math.inf, options[0]
+
+    def compare(mine: list[Polygon], theirs: list[Polygon], wrong: int) -> None:
+        nonlocal least, best
         cost = _WRONG_COST * wrong
         for claim, lost, as_it_is in ((first, theirs, whole[0]), (second, mine, whole[1])):
             if not lost:
@@ -122,8 +122,16 @@ def _shares(piece: Polygon, first: Claim, second: Claim) -> tuple[list[Polygon],
                 left = shapely.difference(claim.outline_mm, MultiPolygon(lost), grid_size=1.0)
                 cost += effort(left) + (_BARRED if left.area < _KEPT_SHARE * claim.outline_mm.area else 0.0)
         if cost < least:
-            least, best = cost, (mine, theirs)
-    return best
+            least, best = cost, (mine, theirs, wrong)
+
+    for option in options:
+        compare(*option)
+    if least - _WRONG_COST * best[2] > sum(whole):  # corners came in
+        for taken, wrong in _retreats(piece, second):
+            compare(taken, none, wrong)
+        for taken, wrong in _retreats(piece, first):
+            compare(none, taken, wrong)
+    return best[:2]
 
 
 def _inside(piece: Polygon, points_mm: IntArray) -> IntArray:
@@ -185,6 +193,7 @@ def effort(area: shapely.Geometry) -> float:
         cost += _PART_COST
         for ring in shapely.get_rings(polygon).tolist():
             edges = np.diff(shapely.get_coordinates(ring), axis=0)
+            edges = edges[edges.any(axis=1)]
             lengths = np.hypot(edges[:, 0], edges[:, 1])
             units = edges / lengths[:, None]
             cosine = (units * np.roll(units, 1, axis=0)).sum(axis=1)
@@ -193,14 +202,16 @@ def effort(area: shapely.Geometry) -> float:
     return cost
 
 
-def left_of(outline_mm: MultiPolygon, kept: Iterable[MultiPolygon], min_area_m2: float) -> MultiPolygon:
+def left_of(outline_mm: MultiPolygon, kept: Sequence[MultiPolygon], min_area_m2: float) -> MultiPolygon:
     """What is left of an outline by what it keeps beside each other one; within all of these, to the millimetre.
 
     Needles are cut off, and parts below the least area left out, except the largest. Empty where others took all.
     """
+    if all(shape is outline_mm for shape in kept):
+        return outline_mm
     # the order decides how crossings are rounded
     limits = sorted({shape.wkb: shape for shape in kept}.items())
-    left = functools.reduce(shapely.intersection, (shape for _, shape in limits)) if limits else outline_mm
+    left = functools.reduce(shapely.intersection, (shape for _, shape in limits))
     own = [_without_short_edges(part) for polygon in polygons_of(left) for part in _without_needles(polygon)]
     within = [_plain(part, left) for polygon in own for part in _on_grid_within(polygon, left)]
     large = [polygon for polygon in within if polygon.area >= min_area_m2 * 1e6]

@@ -1,7 +1,7 @@
-"""Slits between outlines of different candidates, closed where the two touch: each goes to one of them.
+"""Slits between outlines of different candidates, closed where the two touch: each goes to one of the two.
 
 Outlines are drawn one by one, and the points of a wall between two houses may belong to neither. What is closed
-follows from the outlines nearby alone, so two tasks decide alike. Everything is done in integer millimetres.
+follows from the outlines nearby alone, so two tasks decide alike. What lies between several pairs stays open.
 """
 
 from __future__ import annotations
@@ -10,10 +10,10 @@ import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
+import numpy.typing as npt
 import shapely
 from shapely import MultiPolygon, Polygon
 
-from pipeline.model import FloatArray
 from pipeline.roof.disjoint_outlines import effort
 from pipeline.roof.footprint import polygons_of
 
@@ -23,8 +23,10 @@ _FACING_MM = 500.0
 """A slit runs at least this far along both outlines."""
 _ROUNDING_MM = 1.5
 """Corners that lie on an edge are within this of it."""
-_APART_MM, _MARGIN_MM = 2.0, 1.2
-"""What is taken keeps so far away from others, and a margin around it is narrower, after rounding, too."""
+_APART_MM = 2.0
+"""What an outline takes of a slit ends this far from third outlines and from what these may take."""
+_MARGIN_MM = 1.2
+"""Width of a strip around it that belongs to nobody else, whatever is rounded."""
 _MITRE = 1.5
 """Offset corners sharper than 84 degrees are cut: areas between outlines lie within three quarters of the gap."""
 _SHARP_MITRE = 10.0
@@ -83,8 +85,10 @@ def _strip(area: Polygon, own: MultiPolygon, other: MultiPolygon) -> Polygon:
     along = edges[np.argmax(beside)] / beside.max()
     # the slit lies to the right of its own ring, which runs clockwise
     across = np.array([along[1], -along[0]])
-    offset = ring @ across
-    moved = np.rint(across * (offset.max() - offset.min()))
+    width_mm = float(np.ptp(ring @ across))
+    if width_mm > GAP_MM:
+        return area  # it goes around a corner
+    moved = np.rint(across * width_mm)
     swept = shapely.union_all([shapely.transform(own, lambda xy: xy + moved), area], grid_size=1.0)
     added = shapely.difference(swept, shapely.union_all([own, other], grid_size=1.0), grid_size=1.0)
     place = shapely.point_on_surface(area)
@@ -120,17 +124,22 @@ def closed(
         costs = []
         for k, (side, area) in enumerate(options):
             outline = (first_mm, second_mm)[side]
-            grown = shapely.union_all([outline, *taken[side], area], grid_size=1.0)
-            costs.append((effort(grown) - effort(outline), area.area, k))
+            grown = united(outline, [*taken[side], area])
+            costs.append((_plain_effort(grown) - _plain_effort(outline), area.area, k))
         side, area = options[min(costs)[2]]
         taken[side].append(area)
     return taken
 
 
-def without(area: Polygon, others: Sequence[shapely.Geometry]) -> list[Polygon]:
+def _plain_effort(outline_mm: MultiPolygon) -> float:
+    """The effort without the corners that rounding leaves."""
+    return effort(shapely.simplify(outline_mm, 2.0 * _ROUNDING_MM))
+
+
+def without(area: Polygon, others: npt.NDArray[np.object_]) -> list[Polygon]:
     """An area apart from others, in integer millimetres."""
-    near = [other for other in others if shapely.dwithin(area, other, _APART_MM)]
-    if not near:
+    near = others[shapely.dwithin(area, others, _APART_MM)]
+    if len(near) == 0:
         return [area]
     wider = shapely.buffer(shapely.union_all(near, grid_size=1.0), _APART_MM, join_style="mitre")
     return polygons_of(shapely.difference(area, wider, grid_size=1.0))
@@ -143,7 +152,7 @@ def united(outline_mm: MultiPolygon, pieces: Sequence[Polygon]) -> MultiPolygon:
     whole = shapely.union_all([outline_mm, *pieces])
     for distance in (_ROUNDING_MM, -_ROUNDING_MM):
         whole = shapely.buffer(whole, distance, join_style="mitre", mitre_limit=_SHARP_MITRE)
-    return MultiPolygon(polygons_of(shapely.transform(whole, _near_grid)))
+    return MultiPolygon(polygons_of(shapely.set_precision(whole, 1.0)))
 
 
 def widened(kept_mm: MultiPolygon, pieces: Sequence[Polygon]) -> MultiPolygon:
@@ -155,12 +164,6 @@ def widened(kept_mm: MultiPolygon, pieces: Sequence[Polygon]) -> MultiPolygon:
         return kept_mm
     wider = shapely.buffer(pieces, _MARGIN_MM, join_style="mitre", mitre_limit=_SHARP_MITRE)
     return MultiPolygon(polygons_of(shapely.union_all([kept_mm, *wider])))
-
-
-def _near_grid(xy: FloatArray) -> FloatArray:
-    """Places with those coordinates rounded that offsets moved by less than a micrometre."""
-    rounded = np.rint(xy)
-    return np.where(np.abs(xy - rounded) < 1e-3, rounded, xy)
 
 
 def _overlap(area: Polygon, others: MultiPolygon) -> bool:

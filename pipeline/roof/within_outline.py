@@ -52,7 +52,7 @@ def limit_in_mm(outline: MultiPolygon) -> MultiPolygon:
 def within_outline(partition: RoofPartition, outline_mm: MultiPolygon) -> RoofPartition:
     """A coverage in integer millimetres, within an outline; the same object if it was within.
 
-    Raises BuildingError `no_partition` where nothing lies within the outline.
+    Raises BuildingError `no_partition` where nothing lies within the outline, or faces cannot be cut at it.
     """
     shapely.prepare(outline_mm)
     drawn: RoofPartition | None = partition
@@ -85,8 +85,11 @@ def _fitted(partition: RoofPartition, outline_mm: MultiPolygon) -> RoofPartition
         if place not in moved and len(tried):
             moved[place] = tuple(tried[0].tolist())
     rings = [[_moved(ring, moved) for ring in shapely.get_rings(polygon).tolist()] for polygon in polygons.tolist()]
-    edges = Counter(frozenset(edge) for own in rings for ring in own for edge in pairwise(ring))
-    lines = shapely.linestrings([sorted(edge) for edge, times in edges.items() if times == 1])
+    edges = Counter(frozenset(edge) for own in rings for ring in own for edge in pairwise(ring) if edge[0] != edge[1])
+    outer = [sorted(edge) for edge, times in edges.items() if times == 1]
+    if not outer:
+        return None
+    lines = shapely.linestrings(outer)
     between: dict[frozenset[XY], list[XY]] = {}
     for line in lines[~shapely.covers(outline_mm, lines)].tolist():
         near = corners[tree.query(line, predicate="dwithin", distance=_NEAR_MM)]

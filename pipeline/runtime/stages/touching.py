@@ -1,4 +1,4 @@
-"""Candidates whose outlines may touch: their outlines are drawn before they are modelled, and overlaps divided.
+"""Candidates whose outlines may touch: these are drawn before they are modelled, overlaps divided and slits closed.
 
 A task redraws those candidates of one owner that come near others, of whichever tiles. It needs the outlines of these
 others as they are drawn alone, never what other tasks decide. Near a tile's border a candidate is drawn twice.
@@ -22,6 +22,7 @@ from pipeline.io.gps_time import GpsTimeKind
 from pipeline.model import IntArray
 from pipeline.prepared_cloud import prepare_cloud
 from pipeline.roof.disjoint_outlines import Claim, divided, left_of
+from pipeline.roof.footprint import polygons_of
 from pipeline.roof.plan import drawn_outline, roof_points
 from pipeline.roof.roof_settings import RoofSettings
 from pipeline.roof.slits import GAP_MM, Slit, between, closed, slits, united, widened, without
@@ -42,7 +43,7 @@ from pipeline.runtime.stages.sites import (
 )
 from pipeline.runtime.stages.stored_sites import group_figures
 from pipeline.runtime.stages.window_points import surroundings_of
-from pipeline.terrain.lattice import CELL_MM
+from pipeline.terrain.lattice import CELL_MM, NO_DATA
 from pipeline.tiling import MM, Tile, TileGrid, Window
 
 Result = TypeVar("Result")
@@ -88,7 +89,7 @@ class TouchBrief:
 
 
 def drawn_apart(context: RunContext, roof: RoofSettings, joined: Joined) -> Joined:
-    """The candidates of a run, with outlines that do not overlap where they come near each other."""
+    """The candidates of a run, with outlines that neither overlap nor leave slits where they come near each other."""
     started = time.perf_counter()
     owned: dict[Tile, list[StoredGroup]] = collections.defaultdict(list)
     for group in joined.groups:
@@ -235,12 +236,14 @@ def _taken(
         around[i, j] = _or_warned(warnings, (sites[i], sites[j]), areas) or []
     taken: dict[tuple[int, int], list[shapely.Polygon]] = {}
     own = [pair for pair in around if min(pair) < owned and around[pair]]
+    number, outlines = np.array(list(drawn)), np.array(list(drawn.values()), dtype=object)
+    member = np.array([pair for pair, areas in around.items() for _ in areas], np.int64).reshape(-1, 2)
+    area = np.array([area for areas in around.values() for area in areas], dtype=object)
     for (i, j), found in _slits(own, around, sites, drawn, task, warnings).items():
         parts = _or_warned(warnings, (sites[i], sites[j]), functools.partial(closed, drawn[i], drawn[j], found))
         for k, other, pieces in zip((i, j), (j, i), parts or ([], []), strict=True):
-            beside = [outline for m, outline in drawn.items() if m not in (i, j)]
-            beside += [area for pair, areas in around.items() if k not in pair for area in areas]
-            taken[k, other] = [part for piece in pieces for part in without(piece, beside)]
+            third = (outlines[~np.isin(number, (i, j))], area[(member != k).all(axis=1)])
+            taken[k, other] = [part for piece in pieces for part in without(piece, np.concatenate(third))]
     return taken
 
 
@@ -267,29 +270,40 @@ def _slits(
     found = {}
     for i, j in pairs:
         found[i, j] = _or_warned(warnings, (sites[i], sites[j]), functools.partial(of_pair, i, j)) or []
-    areas_mm = [slit.area_mm for pair in pairs for slit in found[pair]]
-    heights = iter(_heights_in(areas_mm, task) if areas_mm else ())
-    return {
-        pair: [slit for slit in found[pair] if _is_built(slit, next(heights), pair, sites, drawn)] for pair in pairs
-    }
+    shown = [shape for pair in pairs for slit in found[pair] for shape in (slit.area_mm, *slit.strips_mm)]
+    heights = iter(_heights_in(shown, task) if shown else ())
+    built: dict[tuple[int, int], list[Slit]] = {}
+    for pair in pairs:
+        per_mm2 = sum(sites[k].points for k in pair) / sum(drawn[k].area for k in pair)
+        shown_in = [(slit, [next(heights) for _ in range(3)]) for slit in found[pair]]
+        built[pair] = [
+            _without_ground(slit, of_strips) for slit, (own, *of_strips) in shown_in if _is_built(slit, own, per_mm2)
+        ]
+    return built
 
 
-def _is_built(
-    slit: Slit,
-    heights_mm: IntArray,
-    pair: Sequence[int],
-    sites: Sequence[CandidateSite],
-    drawn: Mapping[int, MultiPolygon],
-) -> bool:
-    per_mm2 = sum(sites[k].points for k in pair) / sum(drawn[k].area for k in pair)
+def _is_built(slit: Slit, heights_mm: IntArray, per_mm2: float) -> bool:
+    """Whether a slit holds points, but no ground; one narrower than the spacing of so many points may be empty."""
     is_thin = (2.0 * slit.area_mm.area / slit.area_mm.length) ** 2 * per_mm2 < 1.0
     least = 0.0 if is_thin else max(1.0, _LEAST_SEEN * per_mm2 * slit.area_mm.area)
-    is_ground = heights_mm < _GROUND_MM
-    return len(heights_mm) >= least and bool(np.count_nonzero(is_ground) <= _MOST_GROUND * len(heights_mm))
+    return len(heights_mm) >= least and not _is_ground(heights_mm)
+
+
+def _without_ground(slit: Slit, of_strips: Sequence[IntArray]) -> Slit:
+    """A slit whose strips hold no ground: the area itself in place of one that does."""
+    first, second = (
+        slit.area_mm if _is_ground(heights_mm) else strip
+        for strip, heights_mm in zip(slit.strips_mm, of_strips, strict=True)
+    )
+    return dataclasses.replace(slit, strips_mm=(first, second))
+
+
+def _is_ground(heights_mm: IntArray) -> bool:
+    return bool(np.count_nonzero(heights_mm < _GROUND_MM) > _MOST_GROUND * len(heights_mm))
 
 
 def _heights_in(areas_mm: Sequence[shapely.Polygon], task: TouchTask) -> list[IntArray]:
-    """The heights of the points in some areas above the terrain, of single and last returns, millimetres, by area."""
+    """The heights of single and last returns above known terrain, millimetres, by the area that holds them."""
     west, south, east, north = (round(value) for value in shapely.total_bounds(areas_mm))
     around = surroundings_of(task.scratch, task.grid, Window(x0_mm=west, y0_mm=south, x1_mm=east + 1, y1_mm=north + 1))
     boxes = shapely.bounds(areas_mm).astype(np.int64) // CELL_MM - np.tile([around.column0, around.row0], 2)
@@ -298,7 +312,8 @@ def _heights_in(areas_mm: Sequence[shapely.Polygon], task: TouchTask) -> list[In
         cells[y0 : y1 + 1, x0 : x1 + 1] = True
     places = np.concatenate(points_beside(task.scratch, task.grid, np.empty((0, 3), np.int64), cells, around))
     columns, rows = (places[:, :2] // CELL_MM - [around.column0, around.row0]).T
-    heights_mm = places[:, 2] - around.elevation_mm[rows, columns]
+    terrain_mm = around.elevation_mm[rows, columns].astype(np.int64)
+    places, heights_mm = places[terrain_mm != NO_DATA], (places[:, 2] - terrain_mm)[terrain_mm != NO_DATA]
     area, inside = shapely.STRtree(shapely.points(places[:, :2])).query(areas_mm, predicate="contains")
     return [heights_mm[inside[area == k]] for k in range(len(areas_mm))]
 
@@ -326,4 +341,6 @@ def _drawn_mm(site: CandidateSite, task: TouchTask) -> MultiPolygon | None:
     except (BuildingError, shapely.errors.GEOSException):
         return None
     corner = np.array(candidate.origin[:2]) * MM
+    if not outline_mm.is_valid:  # a raw outline may cross itself
+        outline_mm = MultiPolygon(polygons_of(shapely.set_precision(shapely.make_valid(outline_mm), 1.0)))
     return shapely.transform(outline_mm, lambda xy: xy + corner)

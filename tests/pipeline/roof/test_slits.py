@@ -6,7 +6,7 @@ import shapely
 from shapely import MultiPolygon, Polygon
 from shapely.affinity import rotate
 
-from pipeline.roof.slits import between, closed, slits
+from pipeline.roof.slits import between, closed, slits, united
 
 EVERYWHERE = shapely.box(-1e6, -1e6, 1e6, 1e6)
 
@@ -24,8 +24,8 @@ def corners(area: shapely.Geometry) -> int:
     return shapely.get_num_coordinates(shapely.simplify(area, 3.0)) - 1
 
 
-@pytest.mark.parametrize("degrees", [0.0, 31.0])
-def test_the_smaller_one_moves_its_front_up_to_the_larger_one(degrees: float) -> None:
+@pytest.mark.parametrize("degrees", range(0, 180, 13))
+def test_the_smaller_one_moves_its_front_up_to_the_larger_one(degrees: int) -> None:
     house, shed = turned(outline(0, 0, 10, 8), degrees), turned(outline(10.4, 3, 14, 10), degrees)
     (slit,) = slits((house, shed), between(house, shed), EVERYWHERE, (), ())
     assert slit.area_mm.area == pytest.approx(0.4 * 5.0 * 1e6, rel=0.01)
@@ -78,4 +78,23 @@ def test_an_offset_that_crosses_itself_is_mended() -> None:
         (28839, -3995),
     ]  # fmt: skip
     pieces = between(MultiPolygon([Polygon(first)]), MultiPolygon([Polygon(second)]))
+    assert len(pieces) == 1
     assert all(piece.is_valid and piece.area < 8e6 for piece in pieces)
+
+
+def test_a_slit_around_a_corner_moves_no_edge_across_the_court() -> None:
+    wings = MultiPolygon([outline(-5, -5, 0, 3.3).geoms[0].union(outline(-5, -5, 6.9, 0).geoms[0])])
+    shed = outline(0.5, 0.6, 4.5, 3.5)
+    (slit,) = slits((wings, shed), between(wings, shed), EVERYWHERE, (), ())
+    taken = [part for side in closed(wings, shed, [slit]) for part in side]
+    assert shapely.union_all(taken).difference(slit.area_mm).area < 1e3
+
+
+def test_an_outline_and_what_it_takes_are_on_the_grid_without_hairlines() -> None:
+    house, shed = turned(outline(0, 0, 10, 8), 17.0), turned(outline(10.4, 3, 14, 10), 17.0)
+    (slit,) = slits((house, shed), between(house, shed), EVERYWHERE, (), ())
+    grown = united(shed, [slit.area_mm])
+    places = shapely.get_coordinates(grown)
+    assert (places == np.rint(places)).all()
+    assert (np.hypot(*np.diff(places, axis=0).T) > 0.0).all()
+    assert grown.area == pytest.approx(shed.area + slit.area_mm.area, rel=1e-3)

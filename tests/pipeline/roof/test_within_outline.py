@@ -112,3 +112,22 @@ def test_a_building_whose_outline_others_took_has_no_model() -> None:
     result = reconstruct_building(one, "arrangement", ReconstructSettings())
     assert (result.status, result.reason) == (Status.FAILED, Reason.NO_FOOTPRINT)
     assert "others" in result.reason_detail
+
+
+def test_a_needle_whose_corners_become_one_leaves_and_the_others_stay() -> None:
+    outline = MultiPolygon([Polygon([(0, 0), (4000, 1), (8000, 0), (8000, 8000), (0, 8000)])])
+    left = [(0, 0), (3992, 0), (4000, 4000), (4000, 8000), (0, 8000)]
+    right = [(4008, 0), (8000, 0), (8000, 8000), (4000, 8000), (4000, 4000)]
+    needle = [(3992, 0), (4000, 4000), (4008, 0)]
+    for k in range(3):
+        faces = tuple(map(Polygon, (left, needle[k:] + needle[:k], right)))
+        drawn = within_outline(RoofPartition(polygons=faces, labels=np.arange(3, dtype=np.int32)), outline)
+        assert shapely.covers(outline, drawn.polygons).all()
+        assert shapely.area(drawn.polygons).sum() > 0.999 * outline.area
+
+
+def test_a_face_of_which_nothing_is_left_is_no_fault() -> None:
+    outline = MultiPolygon([Polygon([(0, 0), (4000, 1), (8000, 0), (8000, 8000), (0, 8000)])])
+    crumb = RoofPartition(polygons=(Polygon([(4000, 0), (4001, 0), (4000, 1)]),), labels=np.zeros(1, np.int32))
+    with pytest.raises(BuildingError, match="leave the outline"):
+        within_outline(crumb, outline)
