@@ -26,7 +26,7 @@ _ROUNDING_MM = 1.5
 _APART_MM = 2.0
 """What an outline takes of a slit ends this far from third outlines and from what these may take."""
 _MARGIN_MM = 1.2
-"""Width of a strip around it that belongs to nobody else, whatever is rounded."""
+"""Width of a strip around it in which no other outline lies, even after rounding."""
 _MITRE = 1.5
 """Offset corners sharper than 84 degrees are cut: areas between outlines lie within three quarters of the gap."""
 _SHARP_MITRE = 10.0
