@@ -16,7 +16,7 @@ def plain_dispatcher(
     fingerprint: Callable[[], bytes],
     known: tuple[str, ...],
 ) -> Any:
-    """Numba's object for a kernel's plain function; warns once if there are `known` versions, as this is none."""
+    """Numba's object for a kernel's plain function; warns once if this version is not one of those `known`."""
     if known:
         _warn_unknown(known)
     made = numba.njit(cache=True, nogil=True, **options)(function)

@@ -18,7 +18,7 @@ from pipeline.terrain.roof_patches import MIN_TURN, Borders, GrownPatches, Patch
 
 # Not settings: they say what a curved surface is, as those of patches say what a plane is.
 _MAX_TURN = math.cos(math.radians(60.0))
-"""Cosine of the angle between patches that follow each other on a curve: a larger one is an edge."""
+"""Cosine of the angle between patches that follow each other on a curve: a larger angle is an edge."""
 _MIN_BEND_M = 0.02
 """A plane passes over the middle of the next patch of a curve, by at least this."""
 _NEAR_MM = 120.0

@@ -41,7 +41,7 @@ _NARROW_MM = 300.0
 MIN_COSINE = math.cos(math.radians(18.0))
 """Cosine of the largest angle between a patch and the surroundings of its vertices, or another patch of its slope."""
 MIN_TURN = math.cos(math.radians(3.0))
-"""Cosine of the angle between patches from which on they have different directions: a larger one is one plane."""
+"""Cosine of the angle between patches from which on they have different directions: at less they are one plane."""
 _DIRECTIONS = 5
 """Directions of a curve, no two within the least turn: roofs of planes with one ridge have four."""
 _UNKNOWN = 1e30
@@ -549,7 +549,7 @@ def cosine(one: FloatArray, other: FloatArray) -> float:
 
 
 def has_directions(normals: FloatArray) -> bool:
-    """Whether some of the normals (k, 3), as many as a curve has, are no nearer to each other than the least turn."""
+    """Whether the normals (k, 3) have as many directions as a curve has, the least turn apart or more."""
     kept: list[FloatArray] = []
     for normal in normals[np.isfinite(normals).all(axis=1)]:
         if all(cosine(normal, other) <= MIN_TURN for other in kept):

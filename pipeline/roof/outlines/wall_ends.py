@@ -125,7 +125,7 @@ def end_outside(runs: list[Run], outline_mm: MultiPolygon) -> None:
             del runs[first]
 
 
-def without_stubs(wall: Wall, ends: tuple[Met, Met], _edges: FloatArray, scale: Scale) -> None:
+def without_stubs(wall: Wall, ends: tuple[Met, Met], scale: Scale) -> None:
     """Leave out edges at the ends of a wall that would be continued farther than they are long."""
     line = wall.line(scale)
     for end, before, one in ((0, 1, ends[0]), (-1, -2, ends[1])):
@@ -135,7 +135,7 @@ def without_stubs(wall: Wall, ends: tuple[Met, Met], _edges: FloatArray, scale: 
             del wall.runs[end]
 
 
-def put_through_corner(wall: Wall, ends: tuple[Met, Met], edges: FloatArray, scale: Scale) -> None:
+def put_through_corner(wall: Wall, ends: tuple[Met, Met], scale: Scale, edges: FloatArray) -> None:
     """Move the ends of a wall to the corners of the outline, edges (e, 4), beside the places where they meet it.
 
     An end moves if its points speak less against it than an edge costs, and if no angle at the corner is sharp. A

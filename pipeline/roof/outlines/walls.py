@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import itertools
 import math
 from collections.abc import Iterable, Sequence
@@ -103,10 +104,10 @@ def _chords(units: RoofPartition, outline_mm: MultiPolygon, edges: FloatArray, s
         walls[k] = dataclasses.replace(wall, runs=_described(wall.border, wall.directions, scale, ends))
         end_outside(walls[k].runs, outline_mm)
     _put_in_line(walls, edges, most)
-    for change in (without_stubs, put_through_corner):
+    for change in (without_stubs, functools.partial(put_through_corner, edges=edges)):
         lines = [wall.line(scale) for wall in walls]
         for k, wall in enumerate(walls):
-            change(wall, met(lines[k], obstacles_of(edges, lines, k), scale), edges, scale)
+            change(wall, met(lines[k], obstacles_of(edges, lines, k), scale), scale)
     lines = [wall.line(scale) for wall in walls]
     return [ended(line, obstacles_of(edges, lines, k), scale) for k, line in enumerate(lines)]
 
