@@ -114,10 +114,13 @@ def test_a_dismissed_job_ends_although_its_process_does_not_hear(apart: Bench) -
     assert not apart.folder.job(job.job_id).exists()
 
 
+@pytest.mark.parametrize("forked", [True, False], ids=["forked", "spawned"])
 @pytest.mark.parametrize("work", [hostile_attempts.stop_when_asked, hostile_attempts.stop_never_then_work])
 def test_a_driver_that_ends_hands_the_attempt_back_and_the_next_one_goes_on(
-    apart: Bench, work: Callable[..., Any]
+    apart: Bench, monkeypatch: pytest.MonkeyPatch, *, work: Callable[..., Any], forked: bool
 ) -> None:
+    if not forked:
+        monkeypatch.setattr("pipeline.runtime.isolation.child_pool.can_fork", lambda: False)
     apart.work = work
     job = apart.submit()
     driver = apart.driver(drain_s=0.0, stall_s=LONG_S)

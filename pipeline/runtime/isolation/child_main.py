@@ -188,4 +188,5 @@ def _picklable(error: Exception) -> Exception:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    # items import this module by its name, and find the pipe to the parent only there
+    importlib.import_module("pipeline.runtime.isolation.child_main").main(sys.argv[1:])

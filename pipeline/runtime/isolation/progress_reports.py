@@ -1,7 +1,4 @@
-"""What a child process reports of the item at work while it goes on.
-
-In a module of its own: a child that was started as a program is not the module `child_main` that tasks would import.
-"""
+"""What a child process reports of the item at work while it goes on."""
 
 from __future__ import annotations
 
