@@ -95,7 +95,8 @@ BUILDINGS = (
         "roof_type",
         TEXT,
         NONE,
-        "`flat`, `pent`, `gable`, `hip`, `combination`, `unknown`, or `none` without a model",
+        "`flat`, `pent`, `gable`, `half-hip`, `hip`, `pyramid`, `gambrel`, `mansard`, `butterfly`, `sawtooth`, "
+        "`l-shape`, `t-shape`, `cross`, `combination`, `unknown`, or `none` without a model: the main roof decides",
         required=True,
     ),
     Column(

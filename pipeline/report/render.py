@@ -23,22 +23,13 @@ from pipeline.export.geoparquet import read_table
 from pipeline.io import arrow_at
 from pipeline.model import RoofType, Status
 from pipeline.report.maps import round_length
+from pipeline.report.palette import ROOF_COLOURS
 from pipeline.report.perspective import MAP_SUN, View, ViewedFace, draw_view, lambert, shaded
 from pipeline.report.pictures import paths_of, plan_rings
 from pipeline.report.statistics import run_statistics
 from pipeline.runtime.manifest import NAME
 from pipeline.runtime.manifest_reading import read_manifest
 
-ROOF_COLOURS = {
-    RoofType.FLAT: "#9fb4c7",
-    RoofType.PENT: "#6dbb9d",
-    RoofType.GABLE: "#e2725b",
-    RoofType.HIP: "#edb24a",
-    RoofType.COMBINATION: "#a583c0",
-    RoofType.UNKNOWN: "#c8c2b4",
-    RoofType.NONE: "#dddddd",
-}
-"""The colour of each roof type in full light."""
 WALL_COLOUR = "#f1ece1"
 FAILED_COLOUR = "#c22032"
 HATCHES = {

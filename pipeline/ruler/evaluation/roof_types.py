@@ -8,6 +8,7 @@ from enum import StrEnum
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.model import BoolArray, FloatArray, RoofType
 from pipeline.ruler.evaluation.bootstrap import Sums, share
@@ -26,7 +27,7 @@ class Outcome(StrEnum):
     """Quality of a reconstruction."""
 
     CORRECT = "correct"
-    """All roof faces to be found and only those, and the right type."""
+    """All roof faces to be found and only those, and the right one of the paper's five types."""
     PASSABLE = "passable"
     """At least half of the roof faces."""
     FALSE = "false"
@@ -57,7 +58,7 @@ def score_roof_types(
         "faces_found": np.bincount(of_unit[wanted & faces.true["found"][first]], minlength=count),
         "faces_wrong": np.bincount(faces.made["building"][wrong], minlength=count),
     }
-    type_right = (model >= 0) & (true_type == model_type)
+    type_right = (model >= 0) & (_families(true_type) == _families(model_type))
     return {
         "shape": np.array([one.shape if one else None for one in known], object),
         "true_type": true_type,
@@ -72,6 +73,11 @@ def score_roof_types(
             object,
         ),
     }
+
+
+def _families(types: NDArray[np.object_]) -> NDArray[np.object_]:
+    """The types (n,) as the paper names them."""
+    return np.array([one.family for one in types], object)
 
 
 def outcome(faces_to_find: int, faces_found: int, wrong_faces: int, *, type_right: bool) -> Outcome:
@@ -92,7 +98,7 @@ def confusion(rows: Columns, subset: Subset) -> dict[tuple[RoofType, RoofType], 
 
 
 def outcome_tables(rows: Columns, subset: Subset) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """The table of the paper for a subset: one row per true type and one for all; and one row per known shape.
+    """The table of the paper for a subset: one row per true type of its five and for all; and one row per known shape.
 
     The five types of the paper always have a row, others only with buildings.
     """
@@ -102,9 +108,10 @@ def outcome_tables(rows: Columns, subset: Subset) -> tuple[list[dict[str, Any]],
         counts = {one.value: int((counted["outcome"][chosen] == one).sum()) for one in Outcome}
         return {"subset": subset.name, key: name, **counts}
 
-    found = set(counted["true_type"])
+    families = _families(counted["true_type"])
+    found = set(families)
     kinds = (*_PAPER_TYPES, *(kind for kind in _TYPES if kind in found and kind not in _PAPER_TYPES))
-    by_type = [row("true_type", kind.value, counted["true_type"] == kind) for kind in kinds]
+    by_type = [row("true_type", kind.value, families == kind) for kind in kinds]
     by_type.append(row("true_type", "all", np.ones(len(counted["model"]), np.bool_)))
     shapes = sorted({shape for shape in counted["shape"] if shape is not None})
     return by_type, [row("shape", shape, counted["shape"] == shape) for shape in shapes]

@@ -9,8 +9,8 @@ from typing import Any
 
 from pipeline.model import RoofType, Status
 from pipeline.report.page_template import page_template
+from pipeline.report.palette import ROOF_COLOURS
 from pipeline.report.pictures import data_uri
-from pipeline.report.render import ROOF_COLOURS
 from pipeline.ruler.evaluation.chapters import NOTHING
 from pipeline.ruler.evaluation.counted_models import OUTCOMES
 from pipeline.ruler.evaluation.evaluation_writing import INTERVALS, all_notes

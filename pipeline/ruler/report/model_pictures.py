@@ -12,9 +12,10 @@ from matplotlib.collections import LineCollection
 
 from pipeline.model import FaceKind, FloatArray, RoofType
 from pipeline.report.maps import Entry, round_length
+from pipeline.report.palette import ROOF_COLOURS
 from pipeline.report.perspective import View, ViewedFace, draw_view, projected
 from pipeline.report.pictures import blank, plan_rings, png_of, set_frame
-from pipeline.report.render import ROOF_COLOURS, VIEW_SIDE_M, WALL_COLOUR, view_window
+from pipeline.report.render import VIEW_SIDE_M, WALL_COLOUR, view_window
 from pipeline.ruler.evaluation.models import RoofModel
 
 TRUTH_COLOUR = "#2a9470"

@@ -49,7 +49,7 @@ def vertices(result: BuildingResult) -> dict[str, list[bytes]]:
 @pytest.mark.parametrize("method", ["arrangement", "fuzzy-sart"])
 def test_the_finest_is_the_record_and_the_others_stand_beside_it(method: str) -> None:
     result = modelled(house(), *LODS, method=method)
-    assert (result.status, result.lod, result.roof_type) == (Status.OK, "2.2", RoofType.COMBINATION)
+    assert (result.status, result.lod, result.roof_type) == (Status.OK, "2.2", RoofType.GABLE)
     assert [model.lod for model in result.coarser] == ["1.3", "1.2"]
     levels, block = result.coarser
     assert sorted(plane.c for plane in levels.planes) == pytest.approx([2.6, 5.0 + 0.7 * 0.7 * 4.0], abs=0.1)
@@ -66,7 +66,7 @@ def test_a_level_is_the_same_whatever_stands_beside_it(asked: tuple[str, ...]) -
     result = modelled(house(), *asked)
     assert (result.status, result.reason, result.lod) == (Status.OK, None, asked[-1])
     assert vertices(result) == {lod: everything[lod] for lod in asked}
-    assert result.roof_type is RoofType.COMBINATION
+    assert result.roof_type is RoofType.GABLE
 
 
 def test_figures_are_those_of_the_finest_level() -> None:

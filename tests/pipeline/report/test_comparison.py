@@ -19,7 +19,7 @@ from small_runs import moved
 from pipeline.errors import RunError, SettingsError
 from pipeline.io import ReadOptions, Source, SourceInfo
 from pipeline.model import BuildingResult, Reason, RoofType, Status
-from pipeline.report.render import ROOF_COLOURS
+from pipeline.report.palette import ROOF_COLOURS
 from pipeline.ruler.evaluation.evaluate import evaluate
 from pipeline.ruler.evaluation.models import RoofModel
 from pipeline.ruler.evaluation.reading import read_models

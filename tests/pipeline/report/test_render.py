@@ -15,9 +15,10 @@ from matplotlib.patches import PathPatch
 
 from pipeline.errors import RunError
 from pipeline.model import FaceKind, RoofType
+from pipeline.report.palette import ROOF_COLOURS
 from pipeline.report.perspective import MAP_SUN, View, ViewedFace, draw_view, lambert
 from pipeline.report.pictures import drawn_path
-from pipeline.report.render import FAILED_COLOUR, ROOF_COLOURS, render_run
+from pipeline.report.render import FAILED_COLOUR, render_run
 
 TRUTH_COLOUR = "#0050a0"
 DPI = 50

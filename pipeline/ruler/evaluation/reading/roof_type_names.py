@@ -18,18 +18,16 @@ ROOF_TYPE_OF_WORD: Mapping[str, RoofType] = {
     "1010": RoofType.PENT,
     "1030": RoofType.GABLE,
     "1040": RoofType.HIP,
-    "1050": RoofType.HIP,
-    "1060": RoofType.COMBINATION,
-    "1070": RoofType.HIP,
+    "1050": RoofType.HALF_HIP,
+    "1060": RoofType.MANSARD,
+    "1070": RoofType.PYRAMID,
     "1130": RoofType.COMBINATION,
     "monopitch": RoofType.PENT,
     "skillion": RoofType.PENT,
     "gabled": RoofType.GABLE,
     "hipped": RoofType.HIP,
-    "half-hipped": RoofType.HIP,
-    "pyramidal": RoofType.HIP,
-    "mansard": RoofType.COMBINATION,
-    "gambrel": RoofType.COMBINATION,
+    "half-hipped": RoofType.HALF_HIP,
+    "pyramidal": RoofType.PYRAMID,
 }
 """Meanings of the values: words, and codes of the list of roof types of CityGML. `slanted` is too vague."""
 

@@ -2,14 +2,23 @@
  * The category that an object is drawn in: the roof type of a building, or doubtful, fallback or failed; rejected if it
  * was judged not to be a building.
  *
- * Colours are from the palette of Okabe and Ito (2008), distinguishable with every kind of colour blindness;
- * doubtful, fallback, failed and rejected are shown by hatching and outline, too.
+ * Colours are from the palette of Okabe and Ito (2008), distinguishable with every kind of colour blindness; rarer
+ * types have shades of the type that they resemble, as in `pipeline/report/palette.py`; doubtful, fallback, failed and rejected are shown by hatching and outline, too.
  */
 export const CATEGORIES = {
   flat: { label: "Flat", colour: "#56b4e9" },
   pent: { label: "Pent", colour: "#009e73" },
   gable: { label: "Gable", colour: "#e69f00" },
+  "half-hip": { label: "Half-hip", colour: "#b3831a" },
   hip: { label: "Hip", colour: "#cc79a7" },
+  pyramid: { label: "Pyramid", colour: "#9b4f7d" },
+  gambrel: { label: "Gambrel", colour: "#8c5a00" },
+  mansard: { label: "Mansard", colour: "#6e3a5a" },
+  butterfly: { label: "Butterfly", colour: "#5fc9a8" },
+  sawtooth: { label: "Sawtooth", colour: "#00634a" },
+  "l-shape": { label: "L-shape", colour: "#8db7e0" },
+  "t-shape": { label: "T-shape", colour: "#4f86c6" },
+  cross: { label: "Cross", colour: "#1d4f8f" },
   combination: { label: "Combination", colour: "#0072b2" },
   unknown: { label: "Other", colour: "#8d99a6" },
   doubtful: { label: "Doubtful model", colour: "#f0e442" },

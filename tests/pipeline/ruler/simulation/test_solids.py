@@ -166,7 +166,7 @@ def test_terrain_falls_as_steep_and_where_it_should_and_waves_stay_small() -> No
 def test_the_truth_record_names_type_planes_and_block() -> None:
     building = placed(RoofShape.L_SHAPE, SIZES[RoofShape.L_SHAPE])
     record = truth_record(building, (500_000.0, 5_000_000.0, 0.0))
-    assert record.roof_type is RoofType.COMBINATION
+    assert record.roof_type is RoofType.L_SHAPE
     assert record.origin == (500_051.0, 5_000_047.0, 30.0)
     assert len(record.planes) == len(record.faces) == 4
     for face in record.faces:
