@@ -12,20 +12,12 @@ from collections.abc import Callable
 
 import numpy as np
 
-from pipeline.model import FloatArray
-from pipeline.ruler.simulation.envelope import Line, Place, RoofPart, envelope
-from pipeline.ruler.simulation.plots import PlannedBuilding, Plot, packed_plots
+from pipeline.ruler.simulation.envelope import Line, Place, RoofPart
+from pipeline.ruler.simulation.plots import PlannedRoof, packed_plots
 from pipeline.ruler.simulation.random_dimensions import random_dimensions
 from pipeline.ruler.simulation.roof_parts import PARTS, rectangle
-from pipeline.ruler.simulation.roofs import RoofDimensions, RoofFaces, RoofShape
-from pipeline.ruler.simulation.simulated_scene import (
-    Building,
-    Scene,
-    Terrain,
-    face_plane,
-    turned,
-    undulating_terrain,
-)
+from pipeline.ruler.simulation.roofs import RoofShape
+from pipeline.ruler.simulation.simulated_scene import Scene, undulating_terrain
 from pipeline.ruler.simulation.strips import ScannerSettings
 from pipeline.ruler.simulation.sweep import Cell, Row, random_row
 
@@ -145,36 +137,10 @@ SHAPES: dict[str, Callable[[np.random.Generator], Parts]] = {
 ROW = "row"
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class _Planned:
-    """A building before it has a place."""
-
-    name: str
-    roof: RoofFaces
-    """About the middle of its box."""
-    box: PlannedBuilding
-    eave_height_m: float
-
-    def built(self, plot: Plot, terrain: Terrain) -> Building:
-        """The building on its plot: that of the box around it, with its own roof."""
-        around = self.box.built(self.name, plot, self.eave_height_m, terrain)
-        plan = turned(self.roof.vertices[:, :2], plot.x, plot.y, self.box.azimuth_deg)
-        vertices = np.column_stack([plan, self.roof.vertices[:, 2] + around.eave_z_m])
-        planes = tuple(face_plane(vertices[list(face[0])]) for face in self.roof.faces)
-        faces, groups = self.roof.faces, self.roof.groups
-        return dataclasses.replace(around, vertices=vertices, faces=faces, planes=planes, groups=groups)
-
-
-def _planned(shape: str, number: int, random: np.random.Generator) -> _Planned:
-    roof = envelope(SHAPES[shape](random))
-    low, high = roof.vertices.min(axis=0), roof.vertices.max(axis=0)
-    middle: FloatArray = np.append((low + high)[:2] / 2, 0.0)
-    size = RoofDimensions(length_m=float(high[0] - low[0]), width_m=float(high[1] - low[1]))
-    azimuth = float(random.uniform(0.0, 360.0))
-    box = PlannedBuilding(shape=RoofShape.FLAT, dimensions=size, azimuth_deg=azimuth, margin_m=_MARGIN_M)
+def _planned(shape: str, number: int, random: np.random.Generator) -> PlannedRoof:
+    parts, azimuth = SHAPES[shape](random), float(random.uniform(0.0, 360.0))
     eave_m = float(random.uniform(2.3, 3.2) if shape == "trapezoid_shed" else random.uniform(3.0, 9.0))
-    moved = dataclasses.replace(roof, vertices=roof.vertices - middle)
-    return _Planned(name=f"{shape}-{number}", roof=moved, box=box, eave_height_m=eave_m)
+    return PlannedRoof.over(parts, f"{shape}-{number}", azimuth_deg=azimuth, eave_height_m=eave_m, margin_m=_MARGIN_M)
 
 
 def outline_shapes(seed: int) -> Scene:

@@ -8,8 +8,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from pipeline.model import FloatArray
-from pipeline.ruler.simulation.roofs import ROOFS, RoofDimensions, RoofShape
-from pipeline.ruler.simulation.simulated_scene import Building, Terrain, place_building, turned
+from pipeline.ruler.simulation.envelope import RoofPart, envelope
+from pipeline.ruler.simulation.roofs import ROOFS, BrokenForm, RoofDimensions, RoofFaces, RoofShape
+from pipeline.ruler.simulation.simulated_scene import Building, Terrain, face_plane, place_building, turned
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -50,6 +51,47 @@ class PlannedBuilding:
             eave_height_m=eave_height_m,
             terrain=terrain,
         )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PlannedRoof:
+    """A building with a roof of its own making before it has a place."""
+
+    name: str
+    shape: RoofShape | BrokenForm
+    roof: RoofFaces
+    """About the middle of its box."""
+    box: PlannedBuilding
+    eave_height_m: float
+
+    @classmethod
+    def over(
+        cls,
+        parts: Sequence[RoofPart],
+        name: str,
+        *,
+        azimuth_deg: float,
+        eave_height_m: float,
+        margin_m: float,
+        shape: RoofShape | BrokenForm = RoofShape.FLAT,
+    ) -> PlannedRoof:
+        """The envelope of convex parts in any frame."""
+        roof = envelope(parts)
+        low, high = roof.vertices.min(axis=0), roof.vertices.max(axis=0)
+        middle: FloatArray = np.append((low + high)[:2] / 2, 0.0)
+        size = RoofDimensions(length_m=float(high[0] - low[0]), width_m=float(high[1] - low[1]))
+        box = PlannedBuilding(shape=RoofShape.FLAT, dimensions=size, azimuth_deg=azimuth_deg, margin_m=margin_m)
+        moved = dataclasses.replace(roof, vertices=roof.vertices - middle)
+        return cls(name=name, shape=shape, roof=moved, box=box, eave_height_m=eave_height_m)
+
+    def built(self, plot: Plot, terrain: Terrain) -> Building:
+        """The building on its plot: that of the box around it, with its own roof."""
+        around = self.box.built(self.name, plot, self.eave_height_m, terrain)
+        plan = turned(self.roof.vertices[:, :2], plot.x, plot.y, self.box.azimuth_deg)
+        vertices = np.column_stack([plan, self.roof.vertices[:, 2] + around.eave_z_m])
+        planes = tuple(face_plane(vertices[list(face[0])]) for face in self.roof.faces)
+        faces, groups, shape = self.roof.faces, self.roof.groups, self.shape
+        return dataclasses.replace(around, shape=shape, vertices=vertices, faces=faces, planes=planes, groups=groups)
 
 
 def packed_plots(

@@ -37,6 +37,25 @@ class RoofShape(StrEnum):
     MULTI_LEVEL_FLAT = "multi_level_flat"
 
 
+class BrokenForm(StrEnum):
+    """The forms of the suite `broken_slopes`, which have functions of their own there."""
+
+    MANSARD = "mansard"
+    GAMBREL = "gambrel"
+    KICKED_HIP = "kicked_hip"
+    KICKED_GABLE = "kicked_gable"
+    JERKINHEAD = "jerkinhead"
+    CROSS_GABLE = "cross_gable"
+    HEXAGONAL_PYRAMID = "hexagonal_pyramid"
+    SAWTOOTH = "sawtooth"
+    BUTTERFLY = "butterfly"
+    GABLE_DORMERS = "gable_dormers"
+    SHED_DORMERS = "shed_dormers"
+    HIPPED_DORMERS = "hipped_dormers"
+    PARAPET = "parapet"
+    PARAPET_GABLE = "parapet_gable"
+
+
 class AdditionKind(StrEnum):
     """A kind of addition to a roof."""
 

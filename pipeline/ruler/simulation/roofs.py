@@ -11,6 +11,7 @@ from pipeline.ruler.simulation.envelope import envelope
 from pipeline.ruler.simulation.roof_dimensions import (
     Addition,
     AdditionKind,
+    BrokenForm,
     FaceRings,
     FlatPart,
     RoofDimensions,
@@ -25,6 +26,7 @@ __all__ = [
     "ROOF_TYPES",
     "Addition",
     "AdditionKind",
+    "BrokenForm",
     "FaceRings",
     "FlatPart",
     "RoofDimensions",
@@ -32,7 +34,7 @@ __all__ = [
     "RoofShape",
 ]
 
-ROOF_TYPES: dict[RoofShape, RoofType] = {
+ROOF_TYPES: dict[RoofShape | BrokenForm, RoofType] = {
     RoofShape.FLAT: RoofType.FLAT,
     RoofShape.PENT: RoofType.PENT,
     RoofShape.GABLE: RoofType.GABLE,
@@ -49,6 +51,18 @@ ROOF_TYPES: dict[RoofShape, RoofType] = {
     RoofShape.CROSS: RoofType.CROSS,
     RoofShape.COURTYARD: RoofType.COMBINATION,
     RoofShape.MULTI_LEVEL_FLAT: RoofType.FLAT,
+    BrokenForm.KICKED_HIP: RoofType.HIP,
+    BrokenForm.KICKED_GABLE: RoofType.GABLE,
+    BrokenForm.JERKINHEAD: RoofType.GABLE,
+    BrokenForm.CROSS_GABLE: RoofType.COMBINATION,
+    BrokenForm.HEXAGONAL_PYRAMID: RoofType.COMBINATION,
+    BrokenForm.SAWTOOTH: RoofType.COMBINATION,
+    BrokenForm.BUTTERFLY: RoofType.COMBINATION,
+    BrokenForm.GABLE_DORMERS: RoofType.GABLE,
+    BrokenForm.SHED_DORMERS: RoofType.GABLE,
+    BrokenForm.HIPPED_DORMERS: RoofType.GABLE,
+    BrokenForm.PARAPET: RoofType.FLAT,
+    BrokenForm.PARAPET_GABLE: RoofType.GABLE,
 }
 """The roof type of every shape in the records, with any additions."""
 

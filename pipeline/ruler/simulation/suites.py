@@ -11,6 +11,8 @@ from pipeline.errors import SettingsError
 from pipeline.ruler.simulation.als import ScannerSettings
 from pipeline.ruler.simulation.bridges_and_vans import SCANNER as STREET_SCANNER
 from pipeline.ruler.simulation.bridges_and_vans import bridges_and_vans
+from pipeline.ruler.simulation.broken_slopes import CELLS as SLOPE_CELLS
+from pipeline.ruler.simulation.broken_slopes import broken_slopes
 from pipeline.ruler.simulation.city import CITY_SCANNER, TILE_M, CityPlan, Extent, city, hillside
 from pipeline.ruler.simulation.hofmann310 import SCANNER as HOFMANN_SCANNER
 from pipeline.ruler.simulation.hofmann310 import hofmann310
@@ -260,6 +262,15 @@ SUITES: dict[str, Suite] = {
             size_m=(150.0, 500.0),
             is_sized=False,
             cells=OUTLINE_CELLS,
+        ),
+        Suite(
+            name="broken_slopes",
+            summary="roofs whose slopes break, dormers, parapets: 2, 8 and 30 pulses per m2, 0.5 to 5 cm of noise",
+            make=lambda seed, _: broken_slopes(seed),
+            scanner=OUTLINE_SCANNER,
+            size_m=(150.0, 350.0),
+            is_sized=False,
+            cells=SLOPE_CELLS,
         ),
         Suite(
             name="trust",

@@ -44,7 +44,7 @@ def test_an_unknown_split_and_an_impossible_draw_are_both_reported() -> None:
 
 def test_every_roof_shape_is_a_suite_beside_the_scenes() -> None:
     scenes = {"suburb", "town", "cube", "hofmann310", "sweep", "city"}
-    scenes |= {"low_buildings", "bridges_and_vans", "wide_halls", "outline_shapes", "trust"}
+    scenes |= {"low_buildings", "bridges_and_vans", "wide_halls", "outline_shapes", "broken_slopes", "trust"}
     assert scenes | {str(shape) for shape in RoofShape} == set(SUITES)
 
 
@@ -64,7 +64,9 @@ def test_the_same_seed_gives_the_same_scene_and_another_one_another(name: str) -
         assert corners(first) != corners(other)
 
 
-@pytest.mark.parametrize("name", ["suburb", "town", "hofmann310", "sweep", "city", "low_buildings", "outline_shapes"])
+@pytest.mark.parametrize(
+    "name", ["suburb", "town", "hofmann310", "sweep", "city", "low_buildings", "outline_shapes", "broken_slopes"]
+)
 def test_buildings_have_names_of_their_own_and_never_overlap(name: str) -> None:
     scene = scene_of(name, 1003)
     assert len({one.building_id for one in scene.buildings}) == len(scene.buildings)
