@@ -37,9 +37,9 @@ from pipeline.ruler.evaluation.face_matching import Planes, compared, flattened
 from pipeline.ruler.evaluation.face_scores import MIN_FACE_POINTS
 from pipeline.ruler.evaluation.models import RoofModel
 from pipeline.ruler.evaluation.reading import read_models
-from pipeline.ruler.simulation.broken_slopes import CELLS, NAMES
+from pipeline.ruler.simulation.broken_slopes import CELLS
 from pipeline.ruler.simulation.dataset import simulate
-from pipeline.ruler.simulation.roofs import BrokenForm
+from pipeline.ruler.simulation.roofs import ROOF_TYPES, BrokenForm
 from pipeline.ruler.simulation.seeds import seed_of
 from pipeline.ruler.simulation.sweep import Cell
 from pipeline.settings import RunSettings
@@ -77,7 +77,7 @@ class Judged:
     @property
     def is_named(self) -> bool:
         """Whether the roof type is what a person calls it."""
-        return self.roof_type == NAMES[BrokenForm(self.form)]
+        return self.roof_type == ROOF_TYPES[BrokenForm(self.form)]
 
 
 def counted(faces: Planes, per_m2: float) -> BoolArray:

@@ -19,7 +19,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Iterable, Sequence
-from itertools import combinations, product
+from itertools import combinations, permutations, product
 
 from pipeline.model import FaceKind, Plane, RoofFace, RoofType, Solid, SolidFace
 from pipeline.roof.roof_settings import RoofTypeSettings
@@ -27,7 +27,7 @@ from pipeline.roof.roof_settings import RoofTypeSettings
 _HALF = 0.5
 _MAIN = 0.6
 """Share of the sloping faces from which a part of them decides alone."""
-_LEAST_END = 0.01
+_LEAST_END = 0.008
 """Share of the main roof that an end has at least."""
 _END_REACH = 0.7
 """Share of the height of the roof over which an end falls that is not half a hip's."""
@@ -35,8 +35,8 @@ _POINT = 0.04
 """Ridges shorter than this share of the hips are a point."""
 _LEAST_VALLEY = 0.4
 """Share of the longest hip, else of the root of the area, from which a valley is that of a wing."""
-_LEAST_KINK = 0.15
-"""Share of a side's area that the flatter and the steeper faces of a gambrel have at least."""
+_LEAST_KINK, _LEAST_KINK_DEG = 0.15, 5.0
+"""Share of a side's area that the flatter and the steeper face of a gambrel have at least, and their angle."""
 _STEEP_DEG = 45.0
 """Slope of the sides of a mansard under a flat top."""
 _LEAST_ARM = 0.1
@@ -179,7 +179,7 @@ def _named(roof: _Roof, main: Sequence[int], tops: Sequence[int]) -> RoofType:
     wings = _wings(roof, pair, square, total)
     if wings is not None:
         return wings
-    ends = [one for one in square if any(roof.length(roof.ridges, one, other) > 0.0 for other in pair)]
+    ends = [one for one in square if any((p, q) in roof.ridges for p in one.planes for q in _mains(roof, pair))]
     decided = math.fsum(side.area for side in pair + ends) + roof.area(tops)
     if total - decided >= roof.settings.minor_share_together * total:
         return RoofType.COMBINATION
@@ -194,6 +194,12 @@ def _named(roof: _Roof, main: Sequence[int], tops: Sequence[int]) -> RoofType:
     if has_ridge:
         return RoofType.GABLE
     return RoofType.BUTTERFLY if roof.length(roof.bends, first, second) > 0.0 else RoofType.COMBINATION
+
+
+def _mains(roof: _Roof, pair: list[_Side]) -> list[int]:
+    """The planes of two sides that meet in ridges, else the largest of each: no fronts of dormers."""
+    opposite = [(p, q) for one, other in permutations(pair, 2) for p in one.planes for q in other.planes]
+    return [p for p, q in opposite if (p, q) in roof.ridges] or [side.planes[0] for side in pair]
 
 
 def _of_one_side(roof: _Roof, side: _Side, ends: Sequence[_Side], total: float) -> RoofType:
@@ -227,7 +233,7 @@ def _is_kinked(roof: _Roof, side: _Side) -> bool:
     for p in side.planes:
         for q in side.planes:
             steeper_deg = roof.planes[q].slope_deg - roof.planes[p].slope_deg
-            if steeper_deg > roof.settings.slope_tolerance_deg and (p, q) in roof.ridges:
+            if steeper_deg >= _LEAST_KINK_DEG and (p, q) in roof.ridges:
                 least = _LEAST_KINK * side.area
                 if roof.areas[p] >= least and roof.areas[q] >= least:
                     return True

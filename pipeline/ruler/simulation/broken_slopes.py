@@ -111,7 +111,7 @@ def _sawtooth(random: np.random.Generator) -> Parts:
 def _butterfly(random: np.random.Generator) -> Parts:
     """Two planes that fall to a valley near the middle."""
     u, v, valley = _drawn(random, 5.0, 8.0), _drawn(random, 4.0, 6.5), _drawn(random, -1.0, 1.0)
-    right, left = _slope(random, 6.0, 18.0), _slope(random, 6.0, 18.0)
+    right, left = _slope(random, 9.0, 20.0), _slope(random, 9.0, 20.0)
     return [
         _part(rectangle(-u, u, -v, valley), "right", (0.0, -right, right * valley)),
         _part(rectangle(-u, u, valley, v), "left", (0.0, left, -left * valley)),
@@ -193,23 +193,6 @@ FORMS: dict[BrokenForm, Callable[[np.random.Generator], Parts]] = {
     BrokenForm.PARAPET_GABLE: _parapet_gable,
 }
 """Convex parts of a roof of each form."""
-NAMES: dict[BrokenForm, str] = {
-    BrokenForm.MANSARD: "mansard",
-    BrokenForm.GAMBREL: "gambrel",
-    BrokenForm.KICKED_HIP: "hip",
-    BrokenForm.KICKED_GABLE: "gable",
-    BrokenForm.JERKINHEAD: "half-hip",
-    BrokenForm.CROSS_GABLE: "cross",
-    BrokenForm.HEXAGONAL_PYRAMID: "pyramid",
-    BrokenForm.SAWTOOTH: "sawtooth",
-    BrokenForm.BUTTERFLY: "butterfly",
-    BrokenForm.GABLE_DORMERS: "gable",
-    BrokenForm.SHED_DORMERS: "gable",
-    BrokenForm.HIPPED_DORMERS: "gable",
-    BrokenForm.PARAPET: "flat",
-    BrokenForm.PARAPET_GABLE: "gable",
-}
-"""What a person calls the main roof."""
 
 
 def broken_slopes(seed: int) -> Scene:

@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 import shapely
 
-from pipeline.ruler.simulation.broken_slopes import FORMS, NAMES, OF_EACH, broken_slopes
+from pipeline.roof.roof_settings import RoofTypeSettings
+from pipeline.roof.roof_type import roof_type
+from pipeline.ruler.simulation.broken_slopes import FORMS, OF_EACH, broken_slopes
 from pipeline.ruler.simulation.roofs import ROOF_TYPES, BrokenForm
 from pipeline.ruler.simulation.simulated_scene import Building, Scene
 from pipeline.ruler.simulation.solids import truth_record
@@ -36,7 +38,7 @@ def of_form(scene: Scene, form: BrokenForm) -> list[Building]:
 
 
 def test_there_are_four_of_each_form_with_its_faces(scene: Scene) -> None:
-    assert set(FORMS) == set(BrokenForm) == set(NAMES)
+    assert set(FORMS) == set(BrokenForm)
     assert set(FORMS) <= set(ROOF_TYPES)
     for form in FORMS:
         found = of_form(scene, form)
@@ -53,6 +55,13 @@ def test_faces_lie_on_their_planes_and_close_a_solid(scene: Scene) -> None:
             assert plane.a * x + plane.b * y + plane.c == pytest.approx(z, abs=1e-6)
         assert one.vertices[:, 2].min() >= one.eave_z_m - 1e-6
         assert len(truth_record(one, scene.origin).solids) == 1
+
+
+def test_a_true_roof_has_the_name_of_its_form(scene: Scene) -> None:
+    for one in scene.buildings:
+        truth = truth_record(one, scene.origin)
+        found = roof_type(truth.planes, truth.faces, truth.solids, RoofTypeSettings())
+        assert found is ROOF_TYPES[BrokenForm(one.shape)], one.building_id
 
 
 def test_slopes_break_by_six_to_thirty_degrees(scene: Scene) -> None:
