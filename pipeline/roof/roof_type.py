@@ -33,6 +33,8 @@ _END_REACH = 0.7
 """Share of the height of the roof over which an end falls that is not half a hip's."""
 _POINT = 0.04
 """Ridges shorter than this share of the hips are a point."""
+_LEVEL = 0.15
+"""Share of the height of a roof within which tops are at one height."""
 _LEAST_VALLEY = 0.4
 """Share of the longest hip, else of the root of the area, from which a valley is that of a wing."""
 _LEAST_KINK, _LEAST_KINK_DEG = 0.15, 5.0
@@ -302,7 +304,7 @@ def _is_pyramid_of_many(roof: _Roof, sides: Sequence[_Side], total: float) -> bo
     if len(around) <= 4 or math.fsum(side.area for side in around) < (1.0 - roof.settings.minor_share) * total:
         return False
     tops, low = [roof.high(side.planes) for side in around], min(roof.low(side.planes) for side in around)
-    return max(tops) - min(tops) <= _POINT * (max(tops) - low) and all(
+    return max(tops) - min(tops) <= _LEVEL * (max(tops) - low) and all(
         roof.length(roof.ridges, side, other) > 0.0 for side, other in zip(around, around[1:] + around[:1], strict=True)
     )
 
