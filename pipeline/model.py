@@ -86,19 +86,6 @@ class RoofType(StrEnum):
     UNKNOWN = "unknown"
     NONE = "none"
 
-    @property
-    def family(self) -> RoofType:
-        """Its name among the five types of Hofmann, Maas and Streilein (2003); itself if it is none of a roof."""
-        return _FAMILIES.get(self, self)
-
-
-_FAMILIES = {
-    RoofType.HALF_HIP: RoofType.GABLE,
-    RoofType.PYRAMID: RoofType.HIP,
-    **dict.fromkeys((RoofType.GAMBREL, RoofType.MANSARD, RoofType.BUTTERFLY, RoofType.SAWTOOTH), RoofType.COMBINATION),
-    **dict.fromkeys((RoofType.L_SHAPE, RoofType.T_SHAPE, RoofType.CROSS), RoofType.COMBINATION),
-}
-
 
 class HeightSource(StrEnum):
     """Where the height of a model comes from: points, or an attribute of its footprint."""

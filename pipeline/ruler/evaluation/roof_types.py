@@ -18,6 +18,7 @@ from pipeline.ruler.evaluation.measure import Better, Measure, defined
 from pipeline.ruler.evaluation.models import RoofModel
 from pipeline.ruler.evaluation.reference import Reference
 from pipeline.ruler.evaluation.subsets import Columns, Subset, measured_all
+from pipeline.ruler.roof_families import family_of
 
 _TYPES = tuple(RoofType)
 _PAPER_TYPES = (RoofType.FLAT, RoofType.PENT, RoofType.GABLE, RoofType.HIP, RoofType.COMBINATION)
@@ -77,7 +78,7 @@ def score_roof_types(
 
 def _families(types: NDArray[np.object_]) -> NDArray[np.object_]:
     """The types (n,) as the paper names them."""
-    return np.array([one.family for one in types], object)
+    return np.array([family_of(one) for one in types], object)
 
 
 def outcome(faces_to_find: int, faces_found: int, wrong_faces: int, *, type_right: bool) -> Outcome:

@@ -19,6 +19,7 @@ import numpy as np
 import shapely
 
 from pipeline.model import FloatArray, RoofType
+from pipeline.ruler.roof_families import family_of
 from pipeline.ruler.simulation.additions import can_have_dormers, random_dormers, random_superstructures
 from pipeline.ruler.simulation.als import ScannerSettings
 from pipeline.ruler.simulation.plots import PlannedBuilding, Plot, packed_plots
@@ -122,13 +123,15 @@ def _areas(shapes: list[RoofShape], random: np.random.Generator) -> FloatArray:
     areas = np.exp(_AREA_SPREAD * deviates)
     areas *= MEAN_AREA_M2 / areas.mean()
     lift = {RoofType.COMBINATION: 1.2, RoofType.FLAT: 0.5, RoofType.PENT: -0.5}
-    rank = np.argsort(np.argsort(random.normal(size=n) + [lift.get(ROOF_TYPES[shape].family, 0.0) for shape in shapes]))
+    rank = np.argsort(
+        np.argsort(random.normal(size=n) + [lift.get(family_of(ROOF_TYPES[shape]), 0.0) for shape in shapes])
+    )
     return np.asarray(areas[rank])
 
 
 def _drawn_defects(shapes: list[RoofShape], random: np.random.Generator) -> list[tuple[Defect, ...]]:
     """The defects of each building: none for as many of each roof type as the paper expected to be good."""
-    types = [ROOF_TYPES[shape].family for shape in shapes]
+    types = [family_of(ROOF_TYPES[shape]) for shape in shapes]
     hard: list[int] = []
     for roof_type, good in GOOD.items():
         mine = [k for k, one in enumerate(types) if one is roof_type]
@@ -153,7 +156,7 @@ def _planned(
     shape: RoofShape, area_m2: float, wanted: tuple[Defect, ...], random: np.random.Generator
 ) -> tuple[PlannedBuilding, tuple[Defect, ...]]:
     """A building with the additions on its roof, and its defects. A tree replaces an addition that finds no room."""
-    is_gable = ROOF_TYPES[shape].family is RoofType.GABLE
+    is_gable = family_of(ROOF_TYPES[shape]) is RoofType.GABLE
     pitch = float(random.uniform(*_GABLE_PITCH_DEG)) if is_gable else None
     size = random_dimensions(shape, random, area_m2=area_m2, pitch_deg=pitch)
     if shape is RoofShape.UNEQUAL_GABLE:
