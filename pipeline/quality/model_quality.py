@@ -16,7 +16,7 @@ from pipeline.quality.residuals import ResidualSummary, TopSurface, summarise, s
 from pipeline.quality.ridge_height import ridge_height_sigma_m
 from pipeline.quality.roof_returns import MAD_TO_SIGMA, TOLERANCE_M, roof_returns
 from pipeline.quality.unseen_roof import Raster
-from pipeline.roof.roof_type import folds
+from pipeline.roof.roof_sides import folds
 
 GAP_SPACINGS = 1.5
 """A place farther than this from all points is seen by none: of points strewn at random one place in a thousand is."""

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from itertools import combinations, product
 
 from pipeline.model import RoofType
-from pipeline.roof.roof_type import HALF, LEAST_END, Roof, Side
+from pipeline.roof.roof_sides import HALF, LEAST_END, Roof, Side
 
 _LEVEL = 0.15
 """Share of the height of a roof within which tops are at one height."""

@@ -16,22 +16,18 @@ pairs (Hofmann, Maas and Streilein 2003). The finer names follow the list of roo
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from itertools import combinations, permutations, product
 
-from pipeline.model import FaceKind, Plane, RoofFace, RoofType, Solid, SolidFace
+from pipeline.model import Plane, RoofFace, RoofType, Solid
 from pipeline.roof.roof_settings import RoofTypeSettings
+from pipeline.roof.roof_sides import HALF, LEAST_END, Roof, Side, corners_of, folds, turn_deg
 
-HALF = 0.5
-"""Share of the area from which flat faces, or the teeth of a sawtooth, decide."""
 _FEW = 4
 """Sides of a hip roof."""
 _MAIN = 0.6
 """Share of the sloping faces from which a part of them decides alone."""
-LEAST_END = 0.008
-"""Share of the main roof that an end has at least."""
 _END_REACH = 0.7
 """Share of the height of the roof over which an end falls that is not half a hip's."""
 _POINT = 0.04
@@ -40,60 +36,6 @@ _LEAST_KINK, _LEAST_KINK_DEG = 0.15, 5.0
 """Share of a side's area that the flatter and the steeper face of a gambrel have at least, and their angle."""
 _STEEP_DEG = 45.0
 """Slope of the sides of a mansard under a flat top."""
-
-Folds = dict[tuple[int, int], float]
-"""Length in plan over which two planes meet, by their numbers in both orders; each edge counts from both sides."""
-
-
-@dataclasses.dataclass
-class Side:
-    """All roof faces of one direction."""
-
-    aspect_deg: float
-    area: float
-    planes: list[int]
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Roof:
-    """What decides the type of a roof, by the numbers of planes."""
-
-    planes: Sequence[Plane]
-    areas: dict[int, float]
-    ridges: Folds
-    bends: Folds
-    corners: dict[int, list[tuple[float, float, float]]]
-    """Of the faces."""
-    settings: RoofTypeSettings
-
-    def is_flat(self, p: int) -> bool:
-        """Whether a plane is flat."""
-        return self.planes[p].slope_deg < self.settings.flat_below_deg
-
-    def area(self, planes: Iterable[int]) -> float:
-        """Area of the faces of planes."""
-        return math.fsum(self.areas[p] for p in planes)
-
-    def length(self, met: Folds, a: Side, b: Side) -> float:
-        """Length over which the faces of two sides meet."""
-        return math.fsum(met.get(pair, 0.0) for pair in product(sorted(a.planes), sorted(b.planes)))
-
-    def low(self, planes: Iterable[int]) -> float:
-        """Height of the lowest corner of the faces of planes."""
-        return min(z for p in planes for _, _, z in self.corners[p])
-
-    def high(self, planes: Iterable[int]) -> float:
-        """Height of the highest corner of the faces of planes."""
-        return max(z for p in planes for _, _, z in self.corners[p])
-
-    def turned(self, a: Side, b: Side, by_deg: float) -> bool:
-        """Whether the directions of two sides are so far apart."""
-        return abs(_turn(a.aspect_deg, b.aspect_deg) - by_deg) <= self.settings.aspect_tolerance_deg
-
-
-def _turn(a_deg: float, b_deg: float) -> float:
-    """Angle between two aspects, 0 to 180."""
-    return abs((a_deg - b_deg + 180.0) % 360.0 - 180.0)
 
 
 def roof_type(
@@ -111,7 +53,7 @@ def roof_type(
     if math.fsum(areas.values()) <= 0.0:
         return RoofType.NONE
     ridges, bends = folds(planes, solids, settings.sliver_height_m)
-    roof = Roof(planes=planes, areas=areas, ridges=ridges, bends=bends, corners=_corners(solids), settings=settings)
+    roof = Roof(planes=planes, areas=areas, ridges=ridges, bends=bends, corners=corners_of(solids), settings=settings)
     slopes = [p for p in areas if not roof.is_flat(p)]
     # each edge counts from both sides, so that a face with ridges all around has twice its length
     tops = [p for p in areas if roof.is_flat(p) and math.fsum(ridges.get((p, q), 0.0) for q in slopes) >= around[p]]
@@ -119,17 +61,6 @@ def roof_type(
         return RoofType.FLAT
     main = _main_roof(roof, slopes)
     return _named(roof, main, [p for p in tops if any((p, q) in ridges for q in main)])
-
-
-def _corners(solids: Sequence[Solid]) -> dict[int, list[tuple[float, float, float]]]:
-    """The corners of the roof faces of each plane."""
-    corners: dict[int, list[tuple[float, float, float]]] = {}
-    for solid in solids:
-        vertices = solid.vertices.tolist()
-        for face in solid.faces:
-            if face.kind is FaceKind.ROOF:
-                corners.setdefault(face.plane, []).extend(vertices[vertex] for ring in face.rings for vertex in ring)
-    return corners
 
 
 def _main_roof(roof: Roof, slopes: list[int]) -> list[int]:
@@ -150,7 +81,7 @@ def _sides(roof: Roof, slopes: Sequence[int]) -> list[Side]:
     for p in sorted(slopes, key=lambda p: (-roof.areas[p], p)):
         aspect_deg = roof.planes[p].aspect_deg
         for side in sides:
-            if _turn(side.aspect_deg, aspect_deg) <= roof.settings.aspect_tolerance_deg:
+            if turn_deg(side.aspect_deg, aspect_deg) <= roof.settings.aspect_tolerance_deg:
                 side.area += roof.areas[p]
                 side.planes.append(p)
                 break
@@ -238,48 +169,3 @@ def _is_kinked(roof: Roof, side: Side) -> bool:
                 if roof.areas[p] >= least and roof.areas[q] >= least:
                     return True
     return False
-
-
-def folds(planes: Sequence[Plane], solids: Sequence[Solid], sliver_height_m: float) -> tuple[Folds, Folds]:
-    """Where planes meet and fall away on both sides (ridges, hips), and where they do not (bends, valleys).
-
-    Planes meet in a common edge, or across a wall that is nowhere higher than a sliver.
-    """
-    ridges: Folds = {}
-    bends: Folds = {}
-    for solid in solids:
-        vertices: list[tuple[float, float, float]] = solid.vertices.tolist()
-        owner = {edge: face.plane for face in solid.faces if face.kind is FaceKind.ROOF for edge in _edges(face)}
-        met = [(edge, owner[edge[::-1]]) for edge in owner if edge[::-1] in owner]
-        for face in solid.faces:
-            if face.kind is FaceKind.WALL:
-                roof_edges = [edge[::-1] for edge in _edges(face) if edge[::-1] in owner]
-                if len(roof_edges) > 1 and _height_m(vertices, face) <= sliver_height_m:
-                    met += [(edge, owner[other]) for edge in roof_edges for other in roof_edges]
-        for (a, b), right in met:
-            left = owner[a, b]
-            if right == left:
-                continue
-            # a step of one metre to the left of the edge: the left plane lies below the right one's continuation
-            (xa, ya, _), (xb, yb, _) = vertices[a], vertices[b]
-            p, q = planes[left], planes[right]
-            falls = (p.a - q.a) * (ya - yb) + (p.b - q.b) * (xb - xa) < 0.0
-            turned = ridges if falls else bends
-            for pair in ((left, right), (right, left)):
-                turned[pair] = turned.get(pair, 0.0) + math.hypot(xb - xa, yb - ya)
-    return ridges, bends
-
-
-def _edges(face: SolidFace) -> list[tuple[int, int]]:
-    """Directed edges of all rings."""
-    return [edge for ring in face.rings for edge in zip(ring, ring[1:] + ring[:1], strict=True)]
-
-
-def _height_m(vertices: Sequence[tuple[float, float, float]], face: SolidFace) -> float:
-    """Greatest height of a wall over one place."""
-    ends: dict[tuple[float, float], tuple[float, float]] = {}
-    for vertex in face.rings[0]:
-        x, y, z = vertices[vertex]
-        low, high = ends.get((x, y), (z, z))
-        ends[x, y] = min(low, z), max(high, z)
-    return max(high - low for low, high in ends.values())
