@@ -347,7 +347,11 @@ class RoofTypeSettings(Parameters):
         maximum=45.0,
     )
     slope_tolerance_deg: float = parameter(
-        10.0, "Faces of one direction with slopes within this are one side.", unit="deg", minimum=1.0, maximum=45.0
+        5.0,
+        "Slopes of one direction bend where they differ by this: gambrels and mansards.",
+        unit="deg",
+        minimum=1.0,
+        maximum=45.0,
     )
     sliver_height_m: float = parameter(
         0.5,

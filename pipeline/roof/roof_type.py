@@ -32,8 +32,8 @@ _END_REACH = 0.7
 """Share of the height of the roof over which an end falls that is not half a hip's."""
 _POINT = 0.04
 """Ridges shorter than this share of the hips are a point."""
-_LEAST_KINK, _LEAST_KINK_DEG = 0.15, 5.0
-"""Share of a side's area that the flatter and the steeper face of a gambrel have at least, and their angle."""
+_LEAST_KINK = 0.15
+"""Share of a side's area that the flatter and the steeper face of a gambrel have at least."""
 _STEEP_DEG = 45.0
 """Slope of the sides of a mansard under a flat top."""
 
@@ -164,7 +164,7 @@ def _is_kinked(roof: Roof, side: Side) -> bool:
     for p in side.planes:
         for q in side.planes:
             steeper_deg = roof.planes[q].slope_deg - roof.planes[p].slope_deg
-            if steeper_deg >= _LEAST_KINK_DEG and (p, q) in roof.ridges:
+            if steeper_deg >= roof.settings.slope_tolerance_deg and (p, q) in roof.ridges:
                 least = _LEAST_KINK * side.area
                 if roof.areas[p] >= least and roof.areas[q] >= least:
                     return True
