@@ -30,6 +30,7 @@ from benchmarks.entries import Workplace, all_variants, fill_page, hofmann_entri
 from pipeline.extras.compare.compare import Variant
 from pipeline.model import BoolArray, RoofType
 from pipeline.ruler.evaluation.bootstrap import Estimate, bootstrap, share
+from pipeline.ruler.roof_families import family_of
 
 OUTCOMES = ("correct", "passable", "false")
 KINDS = tuple(kind.value for kind in (RoofType.FLAT, RoofType.PENT, RoofType.GABLE, RoofType.HIP, RoofType.COMBINATION))
@@ -92,7 +93,7 @@ def read_outcomes(variant: Variant, place: Workplace, split: str, draws: int) ->
     judged = [row for row in rows if not row["touches_data_edge"]]
     return Outcomes(
         draws=draws,
-        kind=tuple(row["true_type"] for row in judged),
+        kind=tuple(family_of(RoofType(row["true_type"])).value for row in judged),
         good=np.array([bool(row["good"]) for row in judged], np.bool_),
         outcome=tuple(row["outcome"] for row in judged),
     )
