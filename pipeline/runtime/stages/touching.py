@@ -191,8 +191,8 @@ def _outlines_of(
 
     def of_pair(i: int, j: int) -> tuple[MultiPolygon, MultiPolygon]:
         first, second = (
-            dataclasses.replace(claim(k), outline_mm=united(drawn[k], taken.get((k, other), ())))
-            for k, other in ((i, j), (j, i))
+            dataclasses.replace(claim(k), outline_mm=united(drawn[k], pieces)) if pieces else claim(k)
+            for k, pieces in ((i, taken.get((i, j))), (j, taken.get((j, i))))
         )
         return divided(first, second)
 
