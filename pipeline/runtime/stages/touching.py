@@ -1,7 +1,7 @@
 """Candidates whose outlines may touch: these are drawn before they are modelled, overlaps divided and slits closed.
 
-A task redraws those candidates of one owner that come near others, of whichever tiles. It needs the outlines of these
-others as they are drawn alone, never what other tasks decide. Near a tile's border a candidate is drawn twice.
+A task redraws those candidates of some tiles that come near others, of whichever tiles. It needs the outlines of these
+others as they are drawn alone, never what other tasks decide. Near the border of these tiles a candidate is drawn twice.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import collections
 import dataclasses
 import functools
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import TypeVar
@@ -30,7 +31,7 @@ from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import OpenScratch, Scratch
 from pipeline.runtime.scratch.outcomes import Files, InParts, Place, brief_within, drop_outcomes, key_of
 from pipeline.runtime.stages.beside import points_beside
-from pipeline.runtime.stages.gather import gather, points_of
+from pipeline.runtime.stages.gather import gather, points_of, stored_points
 from pipeline.runtime.stages.sites import (
     CandidateSite,
     GroupFigures,
@@ -53,24 +54,28 @@ STAGE = "touching"
 _BESIDE_MM = 2000.0
 """An outline that ends so near to another one stays as it was compared: with the hidden points at walls, which are
 known when it is modelled, it could become that much larger."""
+_DIRECTIONS = 16
+"""Directions in which outlines may be apart; a multiple of four."""
 _CLOSE_MM = 2.0
 """Outlines this near may overlap once their corners are rounded."""
 _LEAST_SEEN = 0.1
 """A slit is closed where it holds at least so much of the points that a roof as large would."""
 _MOST_GROUND, _GROUND_MM = 0.1, 1000
 """At most so many of them lie at the terrain, or less than this above it."""
+_ACROSS = 2
+"""A task takes so many tiles across: along their borders everything is done twice."""
 _HELD = 16
 """Candidates whose points stay in memory from one overlap to the next."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class TouchTask:
-    """The candidates of one owner, and those of others that may touch them."""
+    """The candidates of some owners, and those of others that may touch them."""
 
     own: tuple[StoredGroup, ...]
-    """Groups of the owner."""
+    """Groups of these owners."""
     others: tuple[StoredGroup, ...]
-    """Groups of other owners whose boxes meet those of the owner."""
+    """Groups of other owners whose boxes meet theirs."""
     roof: RoofSettings
     """How outlines are drawn."""
     grid: TileGrid
@@ -81,7 +86,7 @@ class TouchTask:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class TouchBrief:
-    """The owner's groups in which an outline was drawn, by their numbers; in this order they are parts."""
+    """The own groups in which an outline was drawn, by their numbers; in this order they are parts."""
 
     groups: Mapping[int, GroupFigures]
     warnings: tuple[str, ...] = ()
@@ -91,24 +96,26 @@ class TouchBrief:
 def drawn_apart(context: RunContext, roof: RoofSettings, joined: Joined) -> Joined:
     """The candidates of a run, with outlines that neither overlap nor leave slits where they come near each other."""
     started = time.perf_counter()
-    owned: dict[Tile, list[StoredGroup]] = collections.defaultdict(list)
-    for group in joined.groups:
-        owned[group.figures.owner].append(group)
-    tiles = sorted(owned)
-    reach = [box_around(group.figures.reach_mm for group in owned[tile]) for tile in tiles]
+    owned: dict[tuple[int, int], list[StoredGroup]] = collections.defaultdict(list)
+    owners = [group.figures.owner for group in joined.groups]
+    column0, row0 = min(owner.column for owner in owners), min(owner.row for owner in owners)
+    for owner, group in zip(owners, joined.groups, strict=True):
+        owned[(owner.column - column0) // _ACROSS, (owner.row - row0) // _ACROSS].append(group)
+    blocks = sorted(owned)
+    reach = [box_around(group.figures.reach_mm for group in owned[block]) for block in blocks]
     boxes = np.array([None if box is None else shapely.box(*box) for box in reach], object)
     near = collections.defaultdict(list)
     for i, j in shapely.STRtree(boxes).query(boxes).T.tolist():
         if i != j:
             near[i].append(j)
     tasks = {}
-    for k, tile in enumerate(tiles):
-        own, box = tuple(owned[tile]), boxes[k]
-        around = [group for j in sorted(near[k]) for group in owned[tiles[j]] if _meets(group, box)]
+    for k, (column, row) in enumerate(blocks):
+        own, box = tuple(owned[column, row]), boxes[k]
+        around = [group for j in sorted(near[k]) for group in owned[blocks[j]] if _meets(group, box)]
         seen = sorted({one for group in (*own, *around) for one in group.figures.tiles})
         digests = [[group.figures.digest for group in groups] for groups in (own, around)]
         key = key_of(roof, context.plan.grid, digests, joined.around(seen))
-        tasks[Place(STAGE, tile.key, key)] = TouchTask(
+        tasks[Place(STAGE, f"block_x{column}_y{row}", key)] = TouchTask(
             own=own, others=tuple(around), roof=roof, grid=context.plan.grid, scratch=context.scratch
         )
     drop_outcomes(context.scratch, STAGE, tasks)
@@ -167,6 +174,7 @@ def _outlines_of(
     """
     all_pairs = near_pairs(sites)
     compared = set(all_pairs[all_pairs[:, 0] < owned].ravel().tolist())
+    compared &= set(_nearer(all_pairs, sites, task.scratch).ravel().tolist())
     # units of a block that others own are not compared with its own ones, but may lie beside what is
     blocks = {site.block for site in sites[:owned]} - {None}
     compared |= {k for k, site in enumerate(sites) if site.outline is not None and site.block in blocks}
@@ -217,6 +225,23 @@ def _outlines_of(
     return outlines
 
 
+def _nearer(pairs: IntArray, sites: Sequence[CandidateSite], scratch: Scratch) -> IntArray:
+    """Those of some pairs whose outlines may come as near as to be compared, seen across any of some directions."""
+    angles = np.arange(_DIRECTIONS) * (2.0 * math.pi / _DIRECTIONS)
+    directions = np.array([np.cos(angles), np.sin(angles)])
+    reach, farthest = np.zeros(len(sites)), np.zeros((len(sites), _DIRECTIONS))
+    for k in np.unique(pairs).tolist():
+        xy = shapely.get_coordinates(sites[k].outline) * MM
+        if sites[k].outline is None:
+            points = stored_points(scratch, sites[k])
+            xy = np.column_stack((points["x"], points["y"])).astype(np.float64)
+            reach[k] = xy[:, 0].min() - box_around([sites[k].reach_mm])[0]
+        farthest[k] = (xy @ directions).max(axis=0, initial=-math.inf)
+    first, second = pairs.T
+    gap = -farthest[first] - np.roll(farthest[second], _DIRECTIONS // 2, axis=1)
+    return pairs[(gap <= (reach[first] + reach[second] + _BESIDE_MM)[:, None]).all(axis=1)]
+
+
 def _taken(
     pairs: Sequence[Sequence[int]],
     sites: Sequence[CandidateSite],
@@ -263,10 +288,12 @@ def _slits(
 
     def of_pair(i: int, j: int) -> list[Slit]:
         known = shapely.intersection(*(shapely.box(*(sites[k].reach_mm or ())) for k in (i, j)))
-        third = [outline for k, outline in drawn.items() if k not in (i, j) and outline.intersects(known)]
+        beside = shapely.dwithin(outlines, MultiPolygon([*drawn[i].geoms, *drawn[j].geoms]), _BESIDE_MM)
+        third = outlines[beside & shapely.intersects(outlines, known) & ~np.isin(numbers, (i, j))]
         others = [area for pair, areas in around.items() if pair != (i, j) for area in areas if area.intersects(known)]
         return slits((drawn[i], drawn[j]), around[i, j], shapely.buffer(known, -GAP_MM), third, others)
 
+    numbers, outlines = np.array(list(drawn)), np.array(list(drawn.values()), dtype=object)
     found = {}
     for i, j in pairs:
         found[i, j] = _or_warned(warnings, (sites[i], sites[j]), functools.partial(of_pair, i, j)) or []
@@ -334,6 +361,8 @@ def _drawn_mm(site: CandidateSite, task: TouchTask) -> MultiPolygon | None:
     """The outline of a candidate without regard to others, integer millimetres of the CRS; None where none is drawn."""
     if site.outline is not None:
         return shapely.transform(site.outline, lambda xy: np.rint(xy * MM))
+    if site.points < task.roof.min_points:
+        return None
     candidate, _ = gather(task.scratch, task.grid, site, GpsTimeKind.NONE, task.roof)
     try:
         roof = roof_points(prepare_cloud(candidate, task.roof.max_points), task.roof)
