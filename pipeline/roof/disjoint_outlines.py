@@ -284,8 +284,9 @@ def _plain(polygon: Polygon, limit: shapely.Geometry) -> Polygon:
 
 
 def _has_short_edges(polygon: Polygon) -> bool:
-    lines = [np.diff(shapely.get_coordinates(ring), axis=0) for ring in shapely.get_rings(polygon).tolist()]
-    return bool((np.hypot(*np.concatenate(lines).T) < _SHORTEST_MM).any())
+    xy, ring, _ = corners_of_rings([polygon])
+    dx, dy = np.diff(xy, axis=0)[ring[1:] == ring[:-1]].T
+    return bool((np.hypot(dx, dy) < _SHORTEST_MM).any())
 
 
 def _without_needles(polygon: Polygon) -> list[Polygon]:
@@ -303,7 +304,10 @@ def _is_needle(part: Polygon) -> bool:
 
 def _without_short_edges(polygon: Polygon) -> Polygon:
     """A polygon without edges that a solid cannot have, where that adds nothing."""
-    rings = [_thinned(shapely.get_coordinates(ring)[:-1]) for ring in shapely.get_rings(polygon.normalize()).tolist()]
+    polygon = polygon.normalize()
+    if not _has_short_edges(polygon):
+        return polygon
+    rings = [_thinned(shapely.get_coordinates(ring)[:-1]) for ring in shapely.get_rings(polygon).tolist()]
     thinned = Polygon(rings[0], rings[1:])
     return thinned if thinned.is_valid else polygon
 

@@ -49,7 +49,7 @@ class Slit:
 def between(first_mm: MultiPolygon, second_mm: MultiPolygon) -> list[Polygon]:
     """The areas that are less than `GAP_MM` wide between two outlines, integer millimetres."""
     outlines = first_mm, second_mm
-    alone = [_closed_alone(outline) for outline in outlines]
+    alone = [closed for outline in outlines for closed in _closed_alone(outline)]
     both = _closed(shapely.union_all(outlines))
     areas = shapely.difference(both, shapely.union_all([*outlines, *alone], grid_size=1.0), grid_size=1.0)
     return polygons_of(shapely.normalize(areas))
@@ -63,17 +63,19 @@ def slits(
     of_others: Sequence[Polygon],
 ) -> list[Slit]:
     """The slits of some areas between two outlines, apart from third outlines and from areas between other pairs."""
-    taken = shapely.union_all([*third_mm, *of_others], grid_size=1.0)
-    beside = shapely.buffer(shapely.union_all(third_mm), GAP_MM, join_style="mitre")
-    margin = shapely.buffer(list(of_others), _APART_MM, join_style="mitre")
-    free = shapely.difference(within, shapely.union_all([beside, *margin]))
+    own, others = MultiPolygon(list(areas)), np.array([*third_mm, *of_others], dtype=object)
+    taken = shapely.union_all(others[shapely.intersects(others, own)], grid_size=1.0)
+    left = shapely.difference(own, taken, grid_size=1.0)
+    beside = shapely.buffer(others, np.repeat([GAP_MM, _APART_MM], [len(third_mm), len(of_others)]), join_style="mitre")
     both = shapely.union_all(outlines, grid_size=1.0)
     found = []
-    for area in polygons_of(shapely.normalize(shapely.difference(MultiPolygon(list(areas)), taken, grid_size=1.0))):
+    for area in polygons_of(shapely.normalize(left)):
         if not shapely.covers(within, area) or min(_common_mm(area, outline) for outline in outlines) < _FACING_MM:
             continue
         strips = [_strip(area, outline, both) for outline in outlines]
-        mine, other = (strip if shapely.covers(free, strip) else area for strip in strips)
+        mine, other = (
+            strip if shapely.covers(within, strip) and not _overlap(strip, beside) else area for strip in strips
+        )
         found.append(Slit(area_mm=area, strips_mm=(mine, other)))
     return found
 
@@ -111,8 +113,11 @@ def _closed(area: shapely.Geometry) -> shapely.Geometry:
     return shapely.set_precision(shapely.make_valid(narrow, method="structure"), 1.0)
 
 
-_closed_alone = functools.lru_cache(maxsize=_HELD)(_closed)
-"""The same, of an outline that is compared with several others."""
+@functools.lru_cache(maxsize=_HELD)
+def _closed_alone(outline: MultiPolygon) -> list[shapely.Geometry]:
+    """The same, of an outline that is compared with several others; none where nothing lies between."""
+    closed = _closed(outline)
+    return [] if shapely.equals(closed, outline) else [closed]
 
 
 def _common_mm(piece: Polygon, outline_mm: MultiPolygon) -> float:
@@ -131,7 +136,7 @@ def closed(
     taken: tuple[list[Polygon], list[Polygon]] = ([], [])
     efforts = [_plain_effort(outline) for outline in (first_mm, second_mm)]
     for number, slit in enumerate(found):
-        others = MultiPolygon([*taken[0], *taken[1], *(other.area_mm for other in found[number + 1 :])])
+        others = np.array([*taken[0], *taken[1], *(other.area_mm for other in found[number + 1 :])], dtype=object)
         options = [(0, slit.area_mm), (1, slit.area_mm)]
         options += [(side, strip) for side, strip in enumerate(slit.strips_mm) if not _overlap(strip, others)]
         costs = []
@@ -178,5 +183,6 @@ def widened(kept_mm: MultiPolygon, pieces: Sequence[Polygon]) -> MultiPolygon:
     return MultiPolygon(polygons_of(shapely.union_all([kept_mm, *wider])))
 
 
-def _overlap(area: Polygon, others: MultiPolygon) -> bool:
-    return bool(shapely.area(shapely.intersection(area, others)) > 0.0)
+def _overlap(area: Polygon, others: npt.NDArray[np.object_]) -> bool:
+    near = others[shapely.intersects(others, area)]
+    return bool((shapely.area(shapely.intersection(area, near)) > 0.0).any())

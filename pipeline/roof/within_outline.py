@@ -13,6 +13,7 @@ from collections import Counter
 from itertools import pairwise
 
 import numpy as np
+import numpy.typing as npt
 import shapely
 from shapely import MultiPolygon, Polygon
 
@@ -68,8 +69,7 @@ def within_outline(partition: RoofPartition, outline_mm: MultiPolygon) -> RoofPa
 def _fitted(partition: RoofPartition, outline_mm: MultiPolygon) -> RoofPartition | None:
     """A coverage with vertices moved into the outline and its own inserted; None where faces break, or reach far."""
     polygons = np.array(partition.polygons, dtype=object)
-    xy = np.unique(shapely.get_coordinates(polygons), axis=0)
-    corners = np.unique(shapely.get_coordinates(outline_mm), axis=0)
+    xy, corners = _places_of(polygons), _places_of(outline_mm)
     corners = corners[(corners == np.rint(corners)).all(axis=1)]
     tree = shapely.STRtree(shapely.points(corners))
     moved = _places(xy, corners, tree)
@@ -103,6 +103,11 @@ def _fitted(partition: RoofPartition, outline_mm: MultiPolygon) -> RoofPartition
     if not fitted or not (shapely.is_valid(fitted).all() and shapely.coverage_is_valid(fitted)):
         return None
     return dataclasses.replace(partition, polygons=fitted, labels=partition.labels[left])
+
+
+def _places_of(shapes: shapely.Geometry | npt.NDArray[np.object_]) -> FloatArray:
+    """All vertices (n, 2) of some shapes, each once, sorted; as numpy finds them, which takes longer for few."""
+    return np.array(sorted(set(map(tuple, shapely.get_coordinates(shapes).tolist()))))
 
 
 def _places(xy: FloatArray, corners: FloatArray, tree: shapely.STRtree) -> dict[XY, XY]:

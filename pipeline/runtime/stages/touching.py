@@ -1,7 +1,7 @@
 """Candidates whose outlines may touch: these are drawn before they are modelled, overlaps divided and slits closed.
 
 A task redraws those candidates of some tiles that come near others, of whichever tiles. It needs the outlines of these
-others as they are drawn alone, never what other tasks decide. Near the border of these tiles a candidate is drawn twice.
+others as they are drawn alone, never what other tasks decide. Candidates near the border of its tiles are drawn twice.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from pipeline.runtime.stages.sites import (
 from pipeline.runtime.stages.stored_sites import group_figures
 from pipeline.runtime.stages.window_points import surroundings_of
 from pipeline.terrain.lattice import CELL_MM, NO_DATA
-from pipeline.tiling import MM, Tile, TileGrid, Window
+from pipeline.tiling import MM, TileGrid, Window
 
 Result = TypeVar("Result")
 
