@@ -138,7 +138,8 @@ def closed(
     for number, slit in enumerate(found):
         others = np.array([*taken[0], *taken[1], *(other.area_mm for other in found[number + 1 :])], dtype=object)
         options = [(0, slit.area_mm), (1, slit.area_mm)]
-        options += [(side, strip) for side, strip in enumerate(slit.strips_mm) if not _overlap(strip, others)]
+        strips = [(side, strip) for side, strip in enumerate(slit.strips_mm) if strip is not slit.area_mm]
+        options += [(side, strip) for side, strip in strips if not _overlap(strip, others)]
         costs = []
         for k, (side, area) in enumerate(options):
             grown = united((first_mm, second_mm)[side], [*taken[side], area])

@@ -267,8 +267,10 @@ def _taken(
     for (i, j), found in _slits(own, around, sites, drawn, task, warnings).items():
         parts = _or_warned(warnings, (sites[i], sites[j]), functools.partial(closed, drawn[i], drawn[j], found))
         for k, other, pieces in zip((i, j), (j, i), parts or ([], []), strict=True):
-            third = (outlines[~np.isin(number, (i, j))], area[(member != k).all(axis=1)])
-            taken[k, other] = [part for piece in pieces for part in without(piece, np.concatenate(third))]
+            taken[k, other] = []
+            if pieces:
+                third = np.concatenate((outlines[~np.isin(number, (i, j))], area[(member != k).all(axis=1)]))
+                taken[k, other] = [part for piece in pieces for part in without(piece, third)]
     return taken
 
 
@@ -288,12 +290,13 @@ def _slits(
 
     def of_pair(i: int, j: int) -> list[Slit]:
         known = shapely.intersection(*(shapely.box(*(sites[k].reach_mm or ())) for k in (i, j)))
-        beside = shapely.dwithin(outlines, MultiPolygon([*drawn[i].geoms, *drawn[j].geoms]), _BESIDE_MM)
-        third = outlines[beside & shapely.intersects(outlines, known) & ~np.isin(numbers, (i, j))]
+        third = [outlines[k] for k in sorted(tree.query(known, "intersects").tolist()) if numbers[k] not in (i, j)]
+        third = [one for one in third if shapely.dwithin(one, (drawn[i], drawn[j]), _BESIDE_MM).any()]
         others = [area for pair, areas in around.items() if pair != (i, j) for area in areas if area.intersects(known)]
         return slits((drawn[i], drawn[j]), around[i, j], shapely.buffer(known, -GAP_MM), third, others)
 
-    numbers, outlines = np.array(list(drawn)), np.array(list(drawn.values()), dtype=object)
+    numbers, outlines = list(drawn), list(drawn.values())
+    tree = shapely.STRtree(outlines)
     found = {}
     for i, j in pairs:
         found[i, j] = _or_warned(warnings, (sites[i], sites[j]), functools.partial(of_pair, i, j)) or []
