@@ -20,7 +20,7 @@ from shapely import MultiPolygon
 
 from pipeline.errors import BuildingError, GableworkError
 from pipeline.io.gps_time import GpsTimeKind
-from pipeline.model import IntArray
+from pipeline.model import FloatArray, IntArray
 from pipeline.prepared_cloud import prepare_cloud
 from pipeline.roof.disjoint_outlines import Claim, divided, left_of
 from pipeline.roof.footprint import polygons_of
@@ -31,7 +31,7 @@ from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import OpenScratch, Scratch
 from pipeline.runtime.scratch.outcomes import Files, InParts, Place, brief_within, drop_outcomes, key_of
 from pipeline.runtime.stages.beside import points_beside
-from pipeline.runtime.stages.gather import gather, points_of, stored_points
+from pipeline.runtime.stages.gather import gather, stored_points
 from pipeline.runtime.stages.sites import (
     CandidateSite,
     GroupFigures,
@@ -174,16 +174,18 @@ def _outlines_of(
     """
     all_pairs = near_pairs(sites)
     compared = set(all_pairs[all_pairs[:, 0] < owned].ravel().tolist())
-    compared &= set(_nearer(all_pairs, sites, task.scratch).ravel().tolist())
     # units of a block that others own are not compared with its own ones, but may lie beside what is
     blocks = {site.block for site in sites[:owned]} - {None}
     compared |= {k for k, site in enumerate(sites) if site.outline is not None and site.block in blocks}
     drawn: dict[int, MultiPolygon] = {}
+    extents = _Extents(all_pairs, sites, task.scratch)
     for k in sorted(compared):
         task.scratch.check_cancelled()
-        outline_mm = _or_warned(warnings, (sites[k],), functools.partial(_drawn_mm, sites[k], task))
-        if outline_mm is not None:
-            drawn[k] = outline_mm
+        if sites[k].outline is not None or extents.come_near(k):
+            outline_mm = _or_warned(warnings, (sites[k],), functools.partial(_drawn_mm, sites[k], task))
+            if outline_mm is not None:
+                drawn[k] = outline_mm
+            extents.set(k, shapely.get_coordinates(outline_mm), 0.0)
     all_pairs = np.array([(i, j) for i, j in all_pairs.tolist() if i in drawn and j in drawn], np.int64).reshape(-1, 2)
     first, second = (np.array([drawn[k] for k in column.tolist()], object) for column in all_pairs.T)
     taken = _taken(all_pairs[shapely.dwithin(first, second, GAP_MM)].tolist(), sites, owned, drawn, task, warnings)
@@ -193,9 +195,10 @@ def _outlines_of(
 
     @functools.lru_cache(maxsize=_HELD)
     def claim(k: int) -> Claim:
-        points = points_of(task.scratch, sites[k])
+        points = stored_points(task.scratch, sites[k])
         places: IntArray = np.column_stack([points[axis] for axis in "xyz"]).astype(np.int64)
-        return Claim(name=sites[k].building_id, outline_mm=drawn[k], points_mm=places)
+        order = np.argsort(places[:, 0], kind="stable")
+        return Claim(name=sites[k].building_id, outline_mm=drawn[k], points_mm=places[order])
 
     def of_pair(i: int, j: int) -> tuple[MultiPolygon, MultiPolygon]:
         first, second = (
@@ -225,21 +228,33 @@ def _outlines_of(
     return outlines
 
 
-def _nearer(pairs: IntArray, sites: Sequence[CandidateSite], scratch: Scratch) -> IntArray:
-    """Those of some pairs whose outlines may come as near as to be compared, seen across any of some directions."""
-    angles = np.arange(_DIRECTIONS) * (2.0 * math.pi / _DIRECTIONS)
-    directions = np.array([np.cos(angles), np.sin(angles)])
-    reach, farthest = np.zeros(len(sites)), np.zeros((len(sites), _DIRECTIONS))
-    for k in np.unique(pairs).tolist():
-        xy = shapely.get_coordinates(sites[k].outline) * MM
-        if sites[k].outline is None:
-            points = stored_points(scratch, sites[k])
-            xy = np.column_stack((points["x"], points["y"])).astype(np.float64)
-            reach[k] = xy[:, 0].min() - box_around([sites[k].reach_mm])[0]
-        farthest[k] = (xy @ directions).max(axis=0, initial=-math.inf)
-    first, second = pairs.T
-    gap = -farthest[first] - np.roll(farthest[second], _DIRECTIONS // 2, axis=1)
-    return pairs[(gap <= (reach[first] + reach[second] + _BESIDE_MM)[:, None]).all(axis=1)]
+class _Extents:
+    """How far sites may reach in some directions: a site that is apart from all others in any of them is not drawn."""
+
+    def __init__(self, pairs: IntArray, sites: Sequence[CandidateSite], scratch: Scratch) -> None:
+        """Pairs (n, 2) are those sites, by their numbers, whose boxes meet."""
+        self._pairs = pairs
+        self._reach, self._farthest = np.zeros(len(sites)), np.zeros((len(sites), _DIRECTIONS))
+        angles = np.arange(_DIRECTIONS) * (2.0 * math.pi / _DIRECTIONS)
+        self._directions = np.array([np.cos(angles), np.sin(angles)])
+        for k in np.unique(pairs).tolist():
+            if sites[k].outline is not None:
+                self.set(k, shapely.get_coordinates(sites[k].outline) * MM, 0.0)
+            elif (box := sites[k].reach_mm) is not None:
+                points = stored_points(scratch, sites[k])
+                xy = np.column_stack((points["x"], points["y"])).astype(np.float64)
+                self.set(k, xy, float(xy[:, 0].min() - box[0]))
+
+    def set(self, k: int, xy_mm: FloatArray, reach_mm: float) -> None:
+        """Site k covers places (n, 2), and others so near to these at most; nothing if there is none."""
+        self._farthest[k] = (xy_mm @ self._directions).max(axis=0, initial=-math.inf)
+        self._reach[k] = reach_mm
+
+    def come_near(self, k: int) -> bool:
+        """Whether site k may come as near to another one as outlines are compared."""
+        first, second = self._pairs[(self._pairs == k).any(axis=1)].T
+        gap = -self._farthest[first] - np.roll(self._farthest[second], _DIRECTIONS // 2, axis=1)
+        return bool((gap <= (self._reach[first] + self._reach[second] + _BESIDE_MM)[:, None]).all(axis=1).any())
 
 
 def _taken(
