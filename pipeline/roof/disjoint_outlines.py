@@ -144,9 +144,9 @@ def _shares(piece: Polygon, first: Claim, second: Claim) -> tuple[list[Polygon],
     for option in options:
         compare(*option)
     if least - _WRONG_COST * best[2] > sum(whole):  # corners came in
-        for taken, wrong in _retreats(piece, second, (least - whole[0]) / _WRONG_COST):
+        for taken, wrong in _retreats(piece, second, (least - whole[0] - _PART_COST) / _WRONG_COST):
             compare(taken, none, wrong)
-        for taken, wrong in _retreats(piece, first, (least - whole[1]) / _WRONG_COST):
+        for taken, wrong in _retreats(piece, first, (least - whole[1] - _PART_COST) / _WRONG_COST):
             compare(none, taken, wrong)
     return best[:2]
 
