@@ -18,7 +18,9 @@ import numpy as np
 import shapely
 from shapely import MultiPolygon, Polygon
 
+from pipeline.compiler import kernel
 from pipeline.errors import BuildingError
+from pipeline.geometry import corners_of_rings
 from pipeline.model import FloatArray, IntArray
 from pipeline.roof.footprint import polygons_of
 from pipeline.roof.partition import RoofPartition
@@ -45,6 +47,8 @@ _DIRECTIONS = 3
 """Longest edges of an overlap that give a chord its direction."""
 _NEEDLE_MM = 120.0
 """Half the width of a part that is not left of an outline: no wing of a house is as narrow."""
+_LEAST_NEEDLE_MM2 = 0.5 * _NEEDLE_MM * _NEEDLE_MM
+"""What is smaller is no needle."""
 _SHORTEST_MM = 20.0
 """Corners nearer to each other are united when a solid is made, which would move a common border."""
 _PLAIN_MM = 3.0
@@ -64,10 +68,23 @@ class Claim:
     points_mm: IntArray
     """(n, 3), ascending by x; n may be 0."""
 
-    @property
+    @functools.cached_property
     def rank(self) -> tuple[float, str]:
         """The higher one first, which covers the lower one's eave; then by id."""
         return -float(np.median(self.points_mm[:, 2])) if len(self.points_mm) else 0.0, self.name
+
+    @functools.cached_property
+    def effort(self) -> float:
+        """What it takes to describe its outline."""
+        return effort(self.outline_mm)
+
+    @functools.cached_property
+    def inner_mm(self) -> FloatArray:
+        """(k, 2), its points within its outline."""
+        xy = self.points_mm[:, :2].astype(np.float64)
+        shapely.prepare(self.outline_mm)
+        inner: FloatArray = xy[shapely.contains_xy(self.outline_mm, xy)]
+        return inner
 
 
 def divided(first: Claim, second: Claim) -> tuple[MultiPolygon, MultiPolygon]:
@@ -109,7 +126,7 @@ def _shares(piece: Polygon, first: Claim, second: Claim) -> tuple[list[Polygon],
     options = [([piece], none, len(other)), (none, [piece], len(own))]
     if min(len(own), len(other)) >= _FEWEST_WRONG:
         options.extend(_chords(piece, own, other))
-    whole = effort(first.outline_mm), effort(second.outline_mm)
+    whole = first.effort, second.effort
     least, best = math.inf, options[0]
 
     def compare(mine: list[Polygon], theirs: list[Polygon], wrong: int) -> None:
@@ -127,9 +144,9 @@ def _shares(piece: Polygon, first: Claim, second: Claim) -> tuple[list[Polygon],
     for option in options:
         compare(*option)
     if least - _WRONG_COST * best[2] > sum(whole):  # corners came in
-        for taken, wrong in _retreats(piece, second):
+        for taken, wrong in _retreats(piece, second, (least - whole[0] - _PART_COST) / _WRONG_COST):
             compare(taken, none, wrong)
-        for taken, wrong in _retreats(piece, first):
+        for taken, wrong in _retreats(piece, first, (least - whole[1] - _PART_COST) / _WRONG_COST):
             compare(none, taken, wrong)
     return best[:2]
 
@@ -144,8 +161,11 @@ def _inside(piece: Polygon, points_mm: IntArray) -> IntArray:
     return inside
 
 
-def _retreats(piece: Polygon, claim: Claim) -> Iterator[tuple[list[Polygon], int]]:
-    """What a candidate gives up if it ends before a piece, along or square to its longest edge; its points in that."""
+def _retreats(piece: Polygon, claim: Claim, most: float) -> Iterator[tuple[list[Polygon], int]]:
+    """What a candidate gives up if it ends before a piece, along or square to its longest edge; its points in that.
+
+    Left out where these are so many at least.
+    """
     ring = shapely.get_coordinates(max(claim.outline_mm.geoms, key=lambda part: (part.area, part.bounds)).exterior)
     edges = np.diff(ring, axis=0)
     longest = edges[int(np.argmax(np.hypot(edges[:, 0], edges[:, 1])))]
@@ -155,10 +175,12 @@ def _retreats(piece: Polygon, claim: Claim) -> Iterator[tuple[list[Polygon], int
         along = np.rint(reach * longest)
         across = np.array([-along[1], along[0]])
         nearest = places[int(np.argmin((places - places[0]) @ across))]
-        ends = np.array([nearest - along, nearest + along])
-        beyond = shapely.intersection(claim.outline_mm, Polygon([*ends, *(ends[::-1] + across)]), grid_size=1.0)
-        taken = polygons_of(shapely.union_all([beyond, piece], grid_size=1.0))
-        yield taken, sum(len(_inside(one, claim.points_mm)) for one in taken)
+        # points this near to the line may lie on it, rounded
+        if np.count_nonzero(claim.inner_mm @ across > nearest @ across + _PLAIN_MM * math.hypot(*across)) < most:
+            ends = np.array([nearest - along, nearest + along])
+            beyond = shapely.intersection(claim.outline_mm, Polygon([*ends, *(ends[::-1] + across)]), grid_size=1.0)
+            taken = polygons_of(shapely.union_all([beyond, piece], grid_size=1.0))
+            yield taken, sum(len(_inside(one, claim.points_mm)) for one in taken)
         longest = across / reach
 
 
@@ -188,17 +210,35 @@ def _chords(piece: Polygon, own: IntArray, other: IntArray) -> Iterator[tuple[li
 
 def effort(area: shapely.Geometry) -> float:
     """What it takes to describe an area: its corners; acute ones, short edges and parts cost more."""
+    polygons = polygons_of(area)
+    xy, ring, _ = corners_of_rings(polygons)
+    return _PART_COST * len(polygons) + _effort_of_rings(xy, ring)
+
+
+@kernel
+def _effort_of_rings(xy: FloatArray, ring: IntArray) -> float:
+    """The effort of corners (n, 2) of closed rings, each with the number of its ring (n,)."""
     cost = 0.0
-    for polygon in polygons_of(area):
-        cost += _PART_COST
-        for ring in shapely.get_rings(polygon).tolist():
-            edges = np.diff(shapely.get_coordinates(ring), axis=0)
-            edges = edges[edges.any(axis=1)]
-            lengths = np.hypot(edges[:, 0], edges[:, 1])
-            units = edges / lengths[:, None]
-            cosine = (units * np.roll(units, 1, axis=0)).sum(axis=1)
-            cost += np.count_nonzero(cosine < _CORNER_COS) + _ACUTE_COST * np.count_nonzero(cosine < -_ACUTE_COS)
-            cost += _SHORT_COST * np.count_nonzero(lengths < _SHORT_MM)
+    first = last = 0
+    while first < len(xy):
+        last = first
+        while last + 1 < len(xy) and ring[last + 1] == ring[first]:
+            last += 1
+        ux, uy = 0.0, 0.0
+        # the last edge goes before the first one
+        for turn in range(2):
+            for k in range(first, last):
+                dx, dy = xy[k + 1, 0] - xy[k, 0], xy[k + 1, 1] - xy[k, 1]
+                if dx == 0.0 and dy == 0.0:
+                    continue
+                length = math.hypot(dx, dy)
+                vx, vy = dx / length, dy / length
+                if turn == 1:
+                    cosine = ux * vx + uy * vy
+                    cost += (cosine < _CORNER_COS) + _ACUTE_COST * (cosine < -_ACUTE_COS)
+                    cost += _SHORT_COST * (length < _SHORT_MM)
+                ux, uy = vx, vy
+        first = last + 1
     return cost
 
 
@@ -246,26 +286,32 @@ def _plain(polygon: Polygon, limit: shapely.Geometry) -> Polygon:
 
 
 def _has_short_edges(polygon: Polygon) -> bool:
-    lines = [np.diff(shapely.get_coordinates(ring), axis=0) for ring in shapely.get_rings(polygon).tolist()]
-    return bool((np.hypot(*np.concatenate(lines).T) < _SHORTEST_MM).any())
+    xy, ring, _ = corners_of_rings([polygon])
+    dx, dy = np.diff(xy, axis=0)[ring[1:] == ring[:-1]].T
+    return bool((np.hypot(dx, dy) < _SHORTEST_MM).any())
 
 
 def _without_needles(polygon: Polygon) -> list[Polygon]:
     """A polygon without parts that are narrower than two needle widths; nothing is left of one that is a needle."""
     inner = shapely.buffer(polygon, -_NEEDLE_MM, join_style="mitre", mitre_limit=_MITRE)
     opened = shapely.buffer(inner, _NEEDLE_MM, join_style="mitre", mitre_limit=_MITRE)
+    if polygon.area - opened.area < _LEAST_NEEDLE_MM2:
+        return [polygon]
     needles = [one for one in polygons_of(shapely.difference(polygon, opened)) if _is_needle(one)]
     return polygons_of(shapely.difference(polygon, MultiPolygon(needles), grid_size=1.0)) if needles else [polygon]
 
 
 def _is_needle(part: Polygon) -> bool:
     """Whether a part that an opening removes is more than a film along an edge or a cut corner."""
-    return bool(part.area > 0.5 * _NEEDLE_MM * _NEEDLE_MM and 2.0 * part.area > 0.1 * _NEEDLE_MM * part.length)
+    return bool(part.area > _LEAST_NEEDLE_MM2 and 2.0 * part.area > 0.1 * _NEEDLE_MM * part.length)
 
 
 def _without_short_edges(polygon: Polygon) -> Polygon:
     """A polygon without edges that a solid cannot have, where that adds nothing."""
-    rings = [_thinned(shapely.get_coordinates(ring)[:-1]) for ring in shapely.get_rings(polygon.normalize()).tolist()]
+    polygon = polygon.normalize()
+    if not _has_short_edges(polygon):
+        return polygon
+    rings = [_thinned(shapely.get_coordinates(ring)[:-1]) for ring in shapely.get_rings(polygon).tolist()]
     thinned = Polygon(rings[0], rings[1:])
     return thinned if thinned.is_valid else polygon
 

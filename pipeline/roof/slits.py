@@ -7,6 +7,7 @@ follows from the outlines nearby alone, so two tasks decide alike. What lies bet
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 
 import numpy as np
@@ -29,6 +30,8 @@ _MARGIN_MM = 1.2
 """Width of a strip around it in which no other outline lies, even after rounding."""
 _MITRE = 1.5
 """Offset corners sharper than 84 degrees are cut: areas between outlines lie within three quarters of the gap."""
+_HELD = 256
+"""Outlines that stay in memory, closed."""
 _SHARP_MITRE = 10.0
 """The same at hairlines and margins: 12 degrees."""
 
@@ -46,7 +49,8 @@ class Slit:
 def between(first_mm: MultiPolygon, second_mm: MultiPolygon) -> list[Polygon]:
     """The areas that are less than `GAP_MM` wide between two outlines, integer millimetres."""
     outlines = first_mm, second_mm
-    both, *alone = (_closed(area) for area in (shapely.union_all(outlines), *outlines))
+    alone = [closed for outline in outlines for closed in _closed_alone(outline)]
+    both = _closed(shapely.union_all(outlines))
     areas = shapely.difference(both, shapely.union_all([*outlines, *alone], grid_size=1.0), grid_size=1.0)
     return polygons_of(shapely.normalize(areas))
 
@@ -59,22 +63,28 @@ def slits(
     of_others: Sequence[Polygon],
 ) -> list[Slit]:
     """The slits of some areas between two outlines, apart from third outlines and from areas between other pairs."""
-    taken = shapely.union_all([*third_mm, *of_others], grid_size=1.0)
-    beside = shapely.buffer(shapely.union_all(third_mm), GAP_MM, join_style="mitre")
-    margin = shapely.buffer(list(of_others), _APART_MM, join_style="mitre")
-    free = shapely.difference(within, shapely.union_all([beside, *margin]))
+    own, others = MultiPolygon(list(areas)), np.array([*third_mm, *of_others], dtype=object)
+    taken = shapely.union_all(others[shapely.intersects(others, own)], grid_size=1.0)
+    left = shapely.difference(own, taken, grid_size=1.0)
+    beside = shapely.buffer(others, np.repeat([GAP_MM, _APART_MM], [len(third_mm), len(of_others)]), join_style="mitre")
+    both = shapely.union_all(outlines, grid_size=1.0)
     found = []
-    for area in polygons_of(shapely.normalize(shapely.difference(MultiPolygon(list(areas)), taken, grid_size=1.0))):
-        if min(_common_mm(area, outline) for outline in outlines) < _FACING_MM or not shapely.covers(within, area):
+    for area in polygons_of(shapely.normalize(left)):
+        if not shapely.covers(within, area) or min(_common_mm(area, outline) for outline in outlines) < _FACING_MM:
             continue
-        strips = [_strip(area, *pair) for pair in (outlines, outlines[::-1])]
-        mine, other = (strip if shapely.covers(free, strip) else area for strip in strips)
+        strips = [_strip(area, outline, both) for outline in outlines]
+        mine, other = (
+            strip if shapely.covers(within, strip) and not _overlap(strip, beside) else area for strip in strips
+        )
         found.append(Slit(area_mm=area, strips_mm=(mine, other)))
     return found
 
 
-def _strip(area: Polygon, own: MultiPolygon, other: MultiPolygon) -> Polygon:
-    """What an outline covers in addition if its edge beside a slit moves, parallel to itself, up to the other one."""
+def _strip(area: Polygon, own: MultiPolygon, both: shapely.Geometry) -> Polygon:
+    """What an outline covers in addition if its edge beside a slit moves, parallel to itself, up to the other one.
+
+    `both` are the two outlines.
+    """
     ring = shapely.get_coordinates(area.exterior)
     edges = np.diff(ring, axis=0)
     middles = shapely.points(0.5 * (ring[1:] + ring[:-1]))
@@ -90,7 +100,7 @@ def _strip(area: Polygon, own: MultiPolygon, other: MultiPolygon) -> Polygon:
         return area  # it goes around a corner
     moved = np.rint(across * width_mm)
     swept = shapely.union_all([shapely.transform(own, lambda xy: xy + moved), area], grid_size=1.0)
-    added = shapely.difference(swept, shapely.union_all([own, other], grid_size=1.0), grid_size=1.0)
+    added = shapely.difference(swept, both, grid_size=1.0)
     place = shapely.point_on_surface(area)
     return next((piece for piece in polygons_of(added) if shapely.intersects(piece, place)), area)
 
@@ -101,6 +111,13 @@ def _closed(area: shapely.Geometry) -> shapely.Geometry:
     narrow = shapely.buffer(wide, -0.5 * GAP_MM, join_style="mitre", mitre_limit=_MITRE)
     # a mitred offset can cross itself
     return shapely.set_precision(shapely.make_valid(narrow, method="structure"), 1.0)
+
+
+@functools.lru_cache(maxsize=_HELD)
+def _closed_alone(outline: MultiPolygon) -> list[shapely.Geometry]:
+    """The same, of an outline that is compared with several others; none where nothing lies between."""
+    closed = _closed(outline)
+    return [] if shapely.equals(closed, outline) else [closed]
 
 
 def _common_mm(piece: Polygon, outline_mm: MultiPolygon) -> float:
@@ -117,15 +134,16 @@ def closed(
     It is what takes least to describe, then the least area.
     """
     taken: tuple[list[Polygon], list[Polygon]] = ([], [])
+    efforts = [_plain_effort(outline) for outline in (first_mm, second_mm)]
     for number, slit in enumerate(found):
-        others = MultiPolygon([*taken[0], *taken[1], *(other.area_mm for other in found[number + 1 :])])
+        others = np.array([*taken[0], *taken[1], *(other.area_mm for other in found[number + 1 :])], dtype=object)
         options = [(0, slit.area_mm), (1, slit.area_mm)]
-        options += [(side, strip) for side, strip in enumerate(slit.strips_mm) if not _overlap(strip, others)]
+        strips = [(side, strip) for side, strip in enumerate(slit.strips_mm) if strip is not slit.area_mm]
+        options += [(side, strip) for side, strip in strips if not _overlap(strip, others)]
         costs = []
         for k, (side, area) in enumerate(options):
-            outline = (first_mm, second_mm)[side]
-            grown = united(outline, [*taken[side], area])
-            costs.append((_plain_effort(grown) - _plain_effort(outline), area.area, k))
+            grown = united((first_mm, second_mm)[side], [*taken[side], area])
+            costs.append((_plain_effort(grown) - efforts[side], area.area, k))
         side, area = options[min(costs)[2]]
         taken[side].append(area)
     return taken
@@ -166,5 +184,6 @@ def widened(kept_mm: MultiPolygon, pieces: Sequence[Polygon]) -> MultiPolygon:
     return MultiPolygon(polygons_of(shapely.union_all([kept_mm, *wider])))
 
 
-def _overlap(area: Polygon, others: MultiPolygon) -> bool:
-    return bool(shapely.area(shapely.intersection(area, others)) > 0.0)
+def _overlap(area: Polygon, others: npt.NDArray[np.object_]) -> bool:
+    near = others[shapely.intersects(others, area)]
+    return bool((shapely.area(shapely.intersection(area, near)) > 0.0).any())

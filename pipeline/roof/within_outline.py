@@ -17,6 +17,7 @@ import shapely
 from shapely import MultiPolygon, Polygon
 
 from pipeline.errors import BuildingError
+from pipeline.geometry import corners_of_rings
 from pipeline.model import FloatArray, Reason
 from pipeline.roof.footprint import polygons_of
 from pipeline.roof.partition import RoofPartition
@@ -67,47 +68,61 @@ def within_outline(partition: RoofPartition, outline_mm: MultiPolygon) -> RoofPa
 
 def _fitted(partition: RoofPartition, outline_mm: MultiPolygon) -> RoofPartition | None:
     """A coverage with vertices moved into the outline and its own inserted; None where faces break, or reach far."""
-    polygons = np.array(partition.polygons, dtype=object)
-    xy = np.unique(shapely.get_coordinates(polygons), axis=0)
-    corners = np.unique(shapely.get_coordinates(outline_mm), axis=0)
+    all_xy, ring_of, polygon_of = corners_of_rings(partition.polygons)
+    vertices = list(map(tuple, all_xy.tolist()))
+    known = set(vertices)
+    xy = np.array(sorted(known))
+    corners = np.array(sorted(set(map(tuple, shapely.get_coordinates(outline_mm).tolist()))))
     corners = corners[(corners == np.rint(corners)).all(axis=1)]
     tree = shapely.STRtree(shapely.points(corners))
-    moved = _places(xy, corners, tree)
+    moved = _places(known, corners, tree)
     outside = xy[~shapely.intersects_xy(outline_mm, xy[:, 0], xy[:, 1])]
-    points = shapely.points(outside)
-    ways = shapely.shortest_line(outline_mm, points)
+    ways = shapely.shortest_line(outline_mm, shapely.points(outside))
     is_far = (shapely.length(ways) > _FAR_MM).any()
-    if is_far and shapely.area(shapely.difference(polygons, outline_mm)).sum() > _MOST_AREA_MM2:
+    if is_far and shapely.area(shapely.difference(partition.polygons, outline_mm)).sum() > _MOST_AREA_MM2:
         return None
-    for place, way in zip(map(tuple, outside.tolist()), ways.tolist(), strict=True):
-        tried = np.rint(way.coords[0]) + _STEPS_MM
-        tried = tried[shapely.intersects_xy(outline_mm, tried[:, 0], tried[:, 1])]
-        if place not in moved and len(tried):
-            moved[place] = tuple(tried[0].tolist())
-    rings = [[_moved(ring, moved) for ring in shapely.get_rings(polygon).tolist()] for polygon in polygons.tolist()]
-    edges = Counter(frozenset(edge) for own in rings for ring in own for edge in pairwise(ring) if edge[0] != edge[1])
-    outer = [sorted(edge) for edge, times in edges.items() if times == 1]
+    tried = np.rint(shapely.get_coordinates(ways)[::2])[:, None] + _STEPS_MM
+    inside = shapely.intersects_xy(outline_mm, tried[..., 0], tried[..., 1])
+    first = tried[np.arange(len(tried)), inside.argmax(axis=1)]
+    found = inside.any(axis=1)
+    moved = dict(zip(map(tuple, outside[found].tolist()), map(tuple, first[found].tolist()), strict=True)) | moved
+    borders = [0, *(np.flatnonzero(np.diff(ring_of)) + 1).tolist(), len(vertices)]
+    given = [vertices[start:stop] for start, stop in pairwise(borders)]
+    rings = [
+        ring if moved.keys().isdisjoint(ring) and len(set(ring)) == len(ring) - 1 else _moved(ring, moved)
+        for ring in given
+    ]
+    edges = Counter(_edge(a, b) for ring in rings for a, b in pairwise(ring) if a != b)
+    outer = [edge for edge, times in edges.items() if times == 1]
     if not outer:
         return None
     lines = shapely.linestrings(outer)
-    between: dict[frozenset[XY], list[XY]] = {}
+    between: dict[tuple[XY, XY], list[XY]] = {}
     for line in lines[~shapely.covers(outline_mm, lines)].tolist():
         near = corners[tree.query(line, predicate="dwithin", distance=_NEAR_MM)]
         along = {tuple(corner): line.project(shapely.Point(corner)) for corner in near.tolist()}
         inner = {corner: way for corner, way in along.items() if 0.0 < way < line.length}
         a, b = line.coords
-        between[frozenset((a, b))] = [a, *sorted(inner, key=lambda corner: inner[corner]), b]
-    longer = [[_with_corners(ring, between) for ring in own] for own in rings]
-    left = [k for k, own in enumerate(longer) if len(own[0]) > 3]
-    fitted = tuple(Polygon(longer[k][0], [hole for hole in longer[k][1:] if len(hole) > 3]) for k in left)
+        between[a, b] = [a, *sorted(inner, key=lambda corner: inner[corner]), b]
+    longer = [_with_corners(ring, between) for ring in rings]
+    owned: list[list[int]] = [[] for _ in partition.polygons]
+    for k, owner in enumerate(polygon_of.tolist()):
+        owned[owner].append(k)
+    left = [number for number, own in enumerate(owned) if len(longer[own[0]]) > 3]
+    fitted = tuple(
+        partition.polygons[number]
+        if all(longer[k] == given[k] for k in owned[number])
+        else Polygon(longer[owned[number][0]], [longer[k] for k in owned[number][1:] if len(longer[k]) > 3])
+        for number in left
+    )
     if not fitted or not (shapely.is_valid(fitted).all() and shapely.coverage_is_valid(fitted)):
         return None
     return dataclasses.replace(partition, polygons=fitted, labels=partition.labels[left])
 
 
-def _places(xy: FloatArray, corners: FloatArray, tree: shapely.STRtree) -> dict[XY, XY]:
-    """Vertices (n, 2) that take the place of a corner of the outline, and that place."""
-    known = set(map(tuple, xy.tolist()))
+def _places(known: set[XY], corners: FloatArray, tree: shapely.STRtree) -> dict[XY, XY]:
+    """Those of the vertices that take the place of a corner of the outline, and that place."""
+    xy = np.array(sorted(known.difference(map(tuple, corners.tolist())))).reshape(-1, 2)
     near, at = tree.query_nearest(shapely.points(xy), max_distance=_UNITED_MM, all_matches=False)
     return {
         tuple(vertex): tuple(corner)
@@ -116,11 +131,11 @@ def _places(xy: FloatArray, corners: FloatArray, tree: shapely.STRtree) -> dict[
     }
 
 
-def _moved(ring: shapely.LinearRing, moved: dict[XY, XY]) -> list[XY]:
+def _moved(ring: list[XY], moved: dict[XY, XY]) -> list[XY]:
     """The vertices of a ring where they moved to, closed; none twice in a row, and none to which it returns at once."""
     places: list[XY] = []
-    for x, y in ring.coords[:-1]:
-        place = moved.get((x, y), (x, y))
+    for vertex in ring[:-1]:
+        place = moved.get(vertex, vertex)
         if place in places[-2:-1]:
             places.pop()
         elif place not in places[-1:]:
@@ -130,11 +145,18 @@ def _moved(ring: shapely.LinearRing, moved: dict[XY, XY]) -> list[XY]:
     return [*places, places[0]]
 
 
-def _with_corners(ring: list[XY], between: dict[frozenset[XY], list[XY]]) -> list[XY]:
+def _edge(a: XY, b: XY) -> tuple[XY, XY]:
+    """An edge in either direction."""
+    return (a, b) if a < b else (b, a)
+
+
+def _with_corners(ring: list[XY], between: dict[tuple[XY, XY], list[XY]]) -> list[XY]:
     """A closed ring with the vertices that some of its edges, by their ends, take."""
+    if not between:
+        return ring
     longer = ring[:1]
     for a, b in pairwise(ring):
-        path = between.get(frozenset((a, b)), [a, b])
+        path = between.get(_edge(a, b), [a, b])
         longer += path[1:] if path[0] == a else path[-2::-1]
     return longer
 

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import numpy.typing as npt
 import shapely
 
+from pipeline.compiler import kernel
 from pipeline.model import BoolArray, Guide, IntArray
 from pipeline.roof.roof_settings import GUIDE_REACH_M
-from pipeline.runtime.scratch.folder import POINT, Scratch
-from pipeline.runtime.stages.window_points import Surroundings, bucket_paths
+from pipeline.runtime.scratch.folder import Scratch
+from pipeline.runtime.stages.window_points import Surroundings, bucket, bucket_paths
 from pipeline.terrain.lattice import CELL_MM
 from pipeline.tiling import MM, TileGrid, Window
 
@@ -32,15 +34,27 @@ def points_beside(
             y1_mm=(around.row0 + int(rows.max()) + 1) * CELL_MM,
         )
         for path in (path for tile in grid.tiles_over(view) for path in bucket_paths(scratch, tile)):
-            if path.stat().st_size == 0:
-                continue
-            stored = np.memmap(path, POINT, mode="r")
-            near = np.array(stored[view.contains(stored["x"], stored["y"])])
-            near = near[cells[near["y"] // CELL_MM - around.row0, near["x"] // CELL_MM - around.column0]]
-            xyz = np.column_stack((near["x"], near["y"], near["z"].astype(np.int64)))
-            single.append(xyz[near["return_count"] <= 1])
-            later.append(xyz[(near["return_count"] > 1) & (near["return_number"] >= near["return_count"])])
+            xyz, is_single = _last_in(bucket(path), cells, around.column0, around.row0)
+            single.append(xyz[is_single])
+            later.append(xyz[~is_single])
     return _others(single, len(own_mm)), _others(later, len(own_mm))
+
+
+@kernel
+def _last_in(records: npt.NDArray[np.void], cells: BoolArray, column0: int, row0: int) -> tuple[IntArray, BoolArray]:
+    """The places (n, 3), mm, of last returns in some cells (rows, columns), and which of them are the only ones."""
+    rows, columns = cells.shape
+    xyz, is_single = np.empty((records.size, 3), np.int64), np.empty(records.size, np.bool_)
+    n = 0
+    for i in range(records.size):
+        point = records[i]
+        r, c = point.y // CELL_MM - row0, point.x // CELL_MM - column0
+        is_inside = 0 <= r < rows and 0 <= c < columns
+        if is_inside and cells[r, c] and (point.return_count <= 1 or point.return_number >= point.return_count):
+            xyz[n, 0], xyz[n, 1], xyz[n, 2] = point.x, point.y, point.z
+            is_single[n] = point.return_count <= 1
+            n += 1
+    return xyz[:n].copy(), is_single[:n].copy()
 
 
 def guides_near(guides: Sequence[Guide], low_mm: IntArray, high_mm: IntArray, origin_mm: IntArray) -> tuple[Guide, ...]:

@@ -1,7 +1,7 @@
 """Candidates whose outlines may touch: these are drawn before they are modelled, overlaps divided and slits closed.
 
-A task redraws those candidates of one owner that come near others, of whichever tiles. It needs the outlines of these
-others as they are drawn alone, never what other tasks decide. Near a tile's border a candidate is drawn twice.
+A task redraws those candidates of some tiles that come near others, of whichever tiles. It needs the outlines of these
+others as they are drawn alone, never what other tasks decide. Candidates near the border of its tiles are drawn twice.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import collections
 import dataclasses
 import functools
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import TypeVar
@@ -19,7 +20,7 @@ from shapely import MultiPolygon
 
 from pipeline.errors import BuildingError, GableworkError
 from pipeline.io.gps_time import GpsTimeKind
-from pipeline.model import IntArray
+from pipeline.model import FloatArray, IntArray
 from pipeline.prepared_cloud import prepare_cloud
 from pipeline.roof.disjoint_outlines import Claim, divided, left_of
 from pipeline.roof.footprint import polygons_of
@@ -30,7 +31,7 @@ from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import OpenScratch, Scratch
 from pipeline.runtime.scratch.outcomes import Files, InParts, Place, brief_within, drop_outcomes, key_of
 from pipeline.runtime.stages.beside import points_beside
-from pipeline.runtime.stages.gather import gather, points_of
+from pipeline.runtime.stages.gather import gather, stored_points
 from pipeline.runtime.stages.sites import (
     CandidateSite,
     GroupFigures,
@@ -44,7 +45,7 @@ from pipeline.runtime.stages.sites import (
 from pipeline.runtime.stages.stored_sites import group_figures
 from pipeline.runtime.stages.window_points import surroundings_of
 from pipeline.terrain.lattice import CELL_MM, NO_DATA
-from pipeline.tiling import MM, Tile, TileGrid, Window
+from pipeline.tiling import MM, TileGrid, Window
 
 Result = TypeVar("Result")
 
@@ -53,24 +54,28 @@ STAGE = "touching"
 _BESIDE_MM = 2000.0
 """An outline that ends so near to another one stays as it was compared: with the hidden points at walls, which are
 known when it is modelled, it could become that much larger."""
+_DIRECTIONS = 16
+"""Directions in which outlines may be apart; a multiple of four."""
 _CLOSE_MM = 2.0
 """Outlines this near may overlap once their corners are rounded."""
 _LEAST_SEEN = 0.1
 """A slit is closed where it holds at least so much of the points that a roof as large would."""
 _MOST_GROUND, _GROUND_MM = 0.1, 1000
 """At most so many of them lie at the terrain, or less than this above it."""
+_ACROSS = 2
+"""A task takes so many tiles across: along their borders everything is done twice."""
 _HELD = 16
 """Candidates whose points stay in memory from one overlap to the next."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class TouchTask:
-    """The candidates of one owner, and those of others that may touch them."""
+    """The candidates of some owners, and those of others that may touch them."""
 
     own: tuple[StoredGroup, ...]
-    """Groups of the owner."""
+    """Groups of these owners."""
     others: tuple[StoredGroup, ...]
-    """Groups of other owners whose boxes meet those of the owner."""
+    """Groups of other owners whose boxes meet theirs."""
     roof: RoofSettings
     """How outlines are drawn."""
     grid: TileGrid
@@ -81,7 +86,7 @@ class TouchTask:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class TouchBrief:
-    """The owner's groups in which an outline was drawn, by their numbers; in this order they are parts."""
+    """The own groups in which an outline was drawn, by their numbers; in this order they are parts."""
 
     groups: Mapping[int, GroupFigures]
     warnings: tuple[str, ...] = ()
@@ -91,24 +96,26 @@ class TouchBrief:
 def drawn_apart(context: RunContext, roof: RoofSettings, joined: Joined) -> Joined:
     """The candidates of a run, with outlines that neither overlap nor leave slits where they come near each other."""
     started = time.perf_counter()
-    owned: dict[Tile, list[StoredGroup]] = collections.defaultdict(list)
-    for group in joined.groups:
-        owned[group.figures.owner].append(group)
-    tiles = sorted(owned)
-    reach = [box_around(group.figures.reach_mm for group in owned[tile]) for tile in tiles]
+    owned: dict[tuple[int, int], list[StoredGroup]] = collections.defaultdict(list)
+    owners = [group.figures.owner for group in joined.groups]
+    column0, row0 = min(owner.column for owner in owners), min(owner.row for owner in owners)
+    for owner, group in zip(owners, joined.groups, strict=True):
+        owned[(owner.column - column0) // _ACROSS, (owner.row - row0) // _ACROSS].append(group)
+    blocks = sorted(owned)
+    reach = [box_around(group.figures.reach_mm for group in owned[block]) for block in blocks]
     boxes = np.array([None if box is None else shapely.box(*box) for box in reach], object)
     near = collections.defaultdict(list)
     for i, j in shapely.STRtree(boxes).query(boxes).T.tolist():
         if i != j:
             near[i].append(j)
     tasks = {}
-    for k, tile in enumerate(tiles):
-        own, box = tuple(owned[tile]), boxes[k]
-        around = [group for j in sorted(near[k]) for group in owned[tiles[j]] if _meets(group, box)]
+    for k, (column, row) in enumerate(blocks):
+        own, box = tuple(owned[column, row]), boxes[k]
+        around = [group for j in sorted(near[k]) for group in owned[blocks[j]] if _meets(group, box)]
         seen = sorted({one for group in (*own, *around) for one in group.figures.tiles})
         digests = [[group.figures.digest for group in groups] for groups in (own, around)]
         key = key_of(roof, context.plan.grid, digests, joined.around(seen))
-        tasks[Place(STAGE, tile.key, key)] = TouchTask(
+        tasks[Place(STAGE, f"block_x{column}_y{row}", key)] = TouchTask(
             own=own, others=tuple(around), roof=roof, grid=context.plan.grid, scratch=context.scratch
         )
     drop_outcomes(context.scratch, STAGE, tasks)
@@ -171,11 +178,14 @@ def _outlines_of(
     blocks = {site.block for site in sites[:owned]} - {None}
     compared |= {k for k, site in enumerate(sites) if site.outline is not None and site.block in blocks}
     drawn: dict[int, MultiPolygon] = {}
+    extents = _Extents(all_pairs, sites, task.scratch)
     for k in sorted(compared):
         task.scratch.check_cancelled()
-        outline_mm = _or_warned(warnings, (sites[k],), functools.partial(_drawn_mm, sites[k], task))
-        if outline_mm is not None:
-            drawn[k] = outline_mm
+        if sites[k].outline is not None or extents.come_near(k):
+            outline_mm = _or_warned(warnings, (sites[k],), functools.partial(_drawn_mm, sites[k], task))
+            if outline_mm is not None:
+                drawn[k] = outline_mm
+            extents.set(k, shapely.get_coordinates(outline_mm), 0.0)
     all_pairs = np.array([(i, j) for i, j in all_pairs.tolist() if i in drawn and j in drawn], np.int64).reshape(-1, 2)
     first, second = (np.array([drawn[k] for k in column.tolist()], object) for column in all_pairs.T)
     taken = _taken(all_pairs[shapely.dwithin(first, second, GAP_MM)].tolist(), sites, owned, drawn, task, warnings)
@@ -185,14 +195,15 @@ def _outlines_of(
 
     @functools.lru_cache(maxsize=_HELD)
     def claim(k: int) -> Claim:
-        points = points_of(task.scratch, sites[k])
+        points = stored_points(task.scratch, sites[k])
         places: IntArray = np.column_stack([points[axis] for axis in "xyz"]).astype(np.int64)
-        return Claim(name=sites[k].building_id, outline_mm=drawn[k], points_mm=places)
+        order = np.argsort(places[:, 0], kind="stable")
+        return Claim(name=sites[k].building_id, outline_mm=drawn[k], points_mm=places[order])
 
     def of_pair(i: int, j: int) -> tuple[MultiPolygon, MultiPolygon]:
         first, second = (
-            dataclasses.replace(claim(k), outline_mm=united(drawn[k], taken.get((k, other), ())))
-            for k, other in ((i, j), (j, i))
+            dataclasses.replace(claim(k), outline_mm=united(drawn[k], pieces)) if pieces else claim(k)
+            for k, pieces in ((i, taken.get((i, j))), (j, taken.get((j, i))))
         )
         return divided(first, second)
 
@@ -215,6 +226,35 @@ def _outlines_of(
             apart = _or_warned(warnings, (sites[k],), cut)
             outlines[sites[k].building_id] = shapely.transform(drawn[k] if apart is None else apart, lambda xy: xy / MM)
     return outlines
+
+
+class _Extents:
+    """How far sites may reach in some directions: a site that is apart from all others in any of them is not drawn."""
+
+    def __init__(self, pairs: IntArray, sites: Sequence[CandidateSite], scratch: Scratch) -> None:
+        """Pairs (n, 2) are those sites, by their numbers, whose boxes meet."""
+        self._pairs = pairs
+        self._reach, self._farthest = np.zeros(len(sites)), np.zeros((len(sites), _DIRECTIONS))
+        angles = np.arange(_DIRECTIONS) * (2.0 * math.pi / _DIRECTIONS)
+        self._directions = np.array([np.cos(angles), np.sin(angles)])
+        for k in np.unique(pairs).tolist():
+            if sites[k].outline is not None:
+                self.set(k, shapely.get_coordinates(sites[k].outline) * MM, 0.0)
+            elif (box := sites[k].reach_mm) is not None:
+                points = stored_points(scratch, sites[k])
+                xy = np.column_stack((points["x"], points["y"])).astype(np.float64)
+                self.set(k, xy, float(xy[:, 0].min() - box[0]))
+
+    def set(self, k: int, xy_mm: FloatArray, reach_mm: float) -> None:
+        """Site k covers places (n, 2), and others so near to these at most; nothing if there is none."""
+        self._farthest[k] = (xy_mm @ self._directions).max(axis=0, initial=-math.inf)
+        self._reach[k] = reach_mm
+
+    def come_near(self, k: int) -> bool:
+        """Whether site k may come as near to another one as outlines are compared."""
+        first, second = self._pairs[(self._pairs == k).any(axis=1)].T
+        gap = -self._farthest[first] - np.roll(self._farthest[second], _DIRECTIONS // 2, axis=1)
+        return bool((gap <= (self._reach[first] + self._reach[second] + _BESIDE_MM)[:, None]).all(axis=1).any())
 
 
 def _taken(
@@ -242,8 +282,10 @@ def _taken(
     for (i, j), found in _slits(own, around, sites, drawn, task, warnings).items():
         parts = _or_warned(warnings, (sites[i], sites[j]), functools.partial(closed, drawn[i], drawn[j], found))
         for k, other, pieces in zip((i, j), (j, i), parts or ([], []), strict=True):
-            third = (outlines[~np.isin(number, (i, j))], area[(member != k).all(axis=1)])
-            taken[k, other] = [part for piece in pieces for part in without(piece, np.concatenate(third))]
+            taken[k, other] = []
+            if pieces:
+                third = np.concatenate((outlines[~np.isin(number, (i, j))], area[(member != k).all(axis=1)]))
+                taken[k, other] = [part for piece in pieces for part in without(piece, third)]
     return taken
 
 
@@ -263,10 +305,13 @@ def _slits(
 
     def of_pair(i: int, j: int) -> list[Slit]:
         known = shapely.intersection(*(shapely.box(*(sites[k].reach_mm or ())) for k in (i, j)))
-        third = [outline for k, outline in drawn.items() if k not in (i, j) and outline.intersects(known)]
+        third = [outlines[k] for k in sorted(tree.query(known, "intersects").tolist()) if numbers[k] not in (i, j)]
+        third = [one for one in third if shapely.dwithin(one, (drawn[i], drawn[j]), _BESIDE_MM).any()]
         others = [area for pair, areas in around.items() if pair != (i, j) for area in areas if area.intersects(known)]
         return slits((drawn[i], drawn[j]), around[i, j], shapely.buffer(known, -GAP_MM), third, others)
 
+    numbers, outlines = list(drawn), list(drawn.values())
+    tree = shapely.STRtree(outlines)
     found = {}
     for i, j in pairs:
         found[i, j] = _or_warned(warnings, (sites[i], sites[j]), functools.partial(of_pair, i, j)) or []
@@ -334,6 +379,8 @@ def _drawn_mm(site: CandidateSite, task: TouchTask) -> MultiPolygon | None:
     """The outline of a candidate without regard to others, integer millimetres of the CRS; None where none is drawn."""
     if site.outline is not None:
         return shapely.transform(site.outline, lambda xy: np.rint(xy * MM))
+    if site.points < task.roof.min_points:
+        return None
     candidate, _ = gather(task.scratch, task.grid, site, GpsTimeKind.NONE, task.roof)
     try:
         roof = roof_points(prepare_cloud(candidate, task.roof.max_points), task.roof)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from shapely import MultiPolygon, Polygon
 from shapely.affinity import rotate
 
-from pipeline.roof.disjoint_outlines import Claim, _thinned, divided, left_of
+from pipeline.roof.disjoint_outlines import Claim, _thinned, divided, effort, left_of
 
 CORNER_MM = np.array([84_900_000, 447_500_000])
 
@@ -54,6 +54,16 @@ def uncovered_m2(claims: Sequence[Claim], outlines: Sequence[MultiPolygon]) -> f
 def corners(outline: MultiPolygon) -> int:
     """Corners of an outline; those within 2 mm of a straight line do not count."""
     return shapely.get_num_coordinates(shapely.simplify(outline, 2.0)) - len(outline.geoms)
+
+
+def test_the_effort_of_an_area_counts_corners_parts_and_what_is_acute_or_short() -> None:
+    square = shapely.box(0, 0, 9000, 9000)
+    assert effort(square) == 4 + 4
+    assert effort(MultiPolygon([square, shapely.box(20_000, 0, 20_600, 9000)])) == 8 + 8 + 2
+    assert effort(Polygon(square.exterior, [shapely.box(1000, 1000, 2000, 2000).exterior])) == 4 + 8
+    assert effort(Polygon([(0, 0), (9000, 0), (0, 3000)])) == 4 + 3 + 3
+    # a vertex twice, and one that hardly bends an edge
+    assert effort(Polygon([(0, 0), (0, 0), (4000, 10), (9000, 0), (9000, 9000), (0, 9000)])) == 4 + 4
 
 
 def test_two_sheds_that_touch_share_one_straight_wall() -> None:

@@ -15,7 +15,7 @@ from run_tables import rows
 from pipeline.runtime.run import RunSummary
 from pipeline.runtime.stages.sites import CandidateSite, near_pairs
 from pipeline.runtime.stages.stored_sites import SitesBrief, may_touch
-from pipeline.runtime.stages.touching import _or_warned
+from pipeline.runtime.stages.touching import _Extents, _or_warned
 from pipeline.tiling import Tile
 
 SHEDS = (((12.0, 12.0, 24.0, 20.0), 60.0), ((23.7, 13.0, 32.0, 19.0), 54.0), ((14.0, 19.7, 22.0, 27.0), 55.5))
@@ -177,3 +177,29 @@ def test_a_fault_that_nothing_foresaw_is_a_warning_and_a_known_one_is_passed_on(
     assert warnings == ["the outlines of shed are drawn without regard to others: ZeroDivisionError: by zero"]
     with pytest.raises(OSError, match="scratch"):
         _or_warned(warnings, (site,), lambda: fails(OSError("scratch")))
+
+
+def test_sites_that_are_apart_across_any_direction_do_not_come_near() -> None:
+    turned = [shapely.Polygon([(x, 0), (x + 9, 9), (x + 8, 10), (x - 1, 1)]) for x in (0.0, 5.0, 7.0, 60.0)]
+    sites = [
+        CandidateSite(
+            building_id=str(k),
+            owner=Tile(0, 0),
+            ranges=(),
+            points=0,
+            outline=shapely.MultiPolygon([outline]),
+            reach_mm=(0, 0, 0, 0),
+        )
+        for k, outline in enumerate(turned)
+    ]
+    pairs = np.array(list(itertools.combinations(range(3), 2)))
+    extents = _Extents(pairs, sites, None)
+    # the last two touch; the first is 2.1 m away, though the boxes of all of them overlap
+    assert [extents.come_near(k) for k in range(4)] == [False, True, True, False]
+    extents.set(2, np.empty((0, 2)), 0.0)
+    assert not extents.come_near(1)
+    extents.set(1, shapely.get_coordinates(turned[1]) * 1e3, 100.0)
+    assert not extents.come_near(1)
+    extents.set(1, shapely.get_coordinates(turned[1]) * 1e3, 200.0)
+    assert extents.come_near(1)
+    assert extents.come_near(0)
