@@ -99,14 +99,42 @@ def _turns(directions: FloatArray, prices: Prices) -> FloatArray:
 
 
 @kernel(inline="always")
-def _end_price(ux: float, uy: float, is_first: bool, is_last: bool, met: FloatArray, prices: Prices) -> float:
-    """The price of the ends of an edge on the lines that the description begins and ends on, which have two sides."""
-    price = 0.0
-    for k in range(2):
-        if is_first if k == 0 else is_last:
-            mx, my = math.cos(met[k]), math.sin(met[k])
-            price += _turn_price(-abs(ux * mx + uy * my), ux * my - uy * mx, prices)  # no price if it is nan
-    return price
+def _end_price(way: tuple[float, float], line: float, prices: Prices) -> float:
+    """The price of an end of an edge, a unit vector, on a line with a direction, which has two sides; 0 for nan."""
+    ux, uy = math.cos(line), math.sin(line)
+    return _turn_price(-abs(ux * way[0] + uy * way[1]), ux * way[1] - uy * way[0], prices)
+
+
+@kernel(inline="always")
+def _own_direction(sxx: float, sxy: float, syy: float, root: float) -> tuple[float, float]:
+    """The unit vector along a stretch with some moments, `root` the difference of its principal ones."""
+    half = 0.5 * (sxx - syy) / root if root > 0.0 else 0.5
+    return math.sqrt(max(0.5 + half, 0.0)), math.copysign(math.sqrt(max(0.5 - half, 0.0)), sxy)
+
+
+@kernel
+def _in_directions(
+    ux: FloatArray, uy: FloatArray, xy: FloatArray, sums: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Places (m, 2) along each direction, and the first and second moments of `_moments` across it; (d, m) each."""
+    along, across, squares = np.empty((len(ux), len(xy))), np.empty((len(ux), len(xy))), np.empty((len(ux), len(xy)))
+    for k in range(len(ux)):
+        a, b = ux[k], uy[k]
+        for j in range(len(xy)):
+            along[k, j] = a * xy[j, 0] + b * xy[j, 1]
+            across[k, j] = a * sums[j, 2] - b * sums[j, 1]
+            squares[k, j] = a * a * sums[j, 5] - 2.0 * a * b * sums[j, 4] + b * b * sums[j, 3]
+    return along, across, squares
+
+
+@kernel(inline="always")
+def _kept(live: IntArray, costs: FloatArray, most: float) -> int:
+    """Leave out the starts that cost more than the most; the number of those that stay, and one that may follow."""
+    kept = 0
+    for p in range(len(costs)):
+        live[kept] = live[p]
+        kept += costs[p] <= most
+    return kept + 1
 
 
 @kernel(inline="always")
@@ -151,14 +179,8 @@ def least_description(
     xy = border[breaks % len(border)]
     sums = _moments(border, breaks)
     turns = _turns(directions, prices)
-    # places along every direction, and the first and second moments of the border across it
     ux, uy = np.cos(directions), np.sin(directions)
-    along, across, squares = np.empty((d, m)), np.empty((d, m)), np.empty((d, m))
-    for k in range(d):
-        for j in range(m):
-            along[k, j] = ux[k] * xy[j, 0] + uy[k] * xy[j, 1]
-            across[k, j] = ux[k] * sums[j, 2] - uy[k] * sums[j, 1]
-            squares[k, j] = ux[k] * ux[k] * sums[j, 5] - 2.0 * ux[k] * uy[k] * sums[j, 4] + uy[k] * uy[k] * sums[j, 3]
+    along, across, squares = _in_directions(ux, uy, xy, sums)
     # the best description up to each break that ends in a state; the best before an edge that begins in a state
     best = np.full((m, free + 1), np.inf)
     start = np.full((m, free + 1), -1, np.int64)
@@ -203,19 +225,20 @@ def least_description(
                     total = costs[k, p] + (prices.edge + prices.free)
                     if total > best[j, free]:
                         continue
-                    half = 0.5 * (sxx - syy) / root if root > 0.0 else 0.5
-                    vx, vy = math.sqrt(max(0.5 + half, 0.0)), math.copysign(math.sqrt(max(0.5 - half, 0.0)), sxy)
+                    vx, vy = _own_direction(sxx, sxy, syy, root)
                     way = vx * (xy[j, 0] - xy[i, 0]) + vy * (xy[j, 1] - xy[i, 1])
                     if abs(way) < _LEAST_PROGRESS * w:
                         continue
                 if way < 0.0:
                     vx, vy = -vx, -vy
                 last = through[i, state]
-                if i == 0 or j == m - 1:
-                    total += _end_price(vx, vy, i == 0, j == m - 1, met, prices)
-                if i > 0 and (state == free or last == free):
+                if i == 0:
+                    total += _end_price((vx, vy), met[0], prices)
+                elif free in (state, last):
                     bx, by = ways[i, last, 0], ways[i, last, 1]
                     total += _turn_price(bx * vx + by * vy, bx * vy - by * vx, prices)
+                if j == m - 1:
+                    total += _end_price((vx, vy), met[1], prices)
                 if total > best[j, state] or (total == best[j, state] and i > start[j, state]):
                     continue
                 best[j, state], start[j, state], came[j, state] = total, i, last
@@ -223,12 +246,8 @@ def least_description(
         _turn(best[j], turns, before[j], through[j])
         for k in range(d + 1):
             most = max(before[j, 2 * k], before[j, min(2 * k + 1, free)]) + spare
-            kept = 0
-            for p in range(alive[k]):
-                live[k, kept] = live[k, p]
-                kept += costs[k, p] <= most
-            live[k, kept] = j
-            alive[k] = kept + 1
+            alive[k] = _kept(live[k], costs[k, : alive[k]], most)
+            live[k, alive[k] - 1] = j
     state = int(np.argmin(best[m - 1]))
     ends, of_edge, along_edge = _traced_back(start, came, ways, directions, state)
     return ends, of_edge, along_edge, best[m - 1, state]

@@ -20,6 +20,7 @@ import numpy as np
 import shapely
 from shapely import LineString, MultiPolygon, Polygon
 
+from pipeline.compiler import kernel
 from pipeline.errors import BuildingError
 from pipeline.model import FloatArray, IntArray, LabelArray
 from pipeline.roof.footprint import polygons_of
@@ -92,24 +93,27 @@ def _chords(units: RoofPartition, outline_mm: MultiPolygon, edges: FloatArray, s
     scale = Scale.of(spacing_m)
     most = max(_IN_LINE_MM, scale.spacing_mm)
     walls = []
+    pieces = shapely.linestrings(edges.reshape(-1, 2, 2))
     for border in _through(_borders(units, shapely.buffer(outline_mm, scale.beyond_mm))):
-        near = edges[shapely.distance(LineString(border), shapely.linestrings(edges.reshape(-1, 2, 2))) <= _NEARBY_MM]
+        near = edges[shapely.distance(LineString(border), pieces) <= _NEARBY_MM]
         directions = pairs_of(peaks_of(_edge_runs(near)))
         walls.append(Wall(border, directions, _described(border, directions, scale)))
     _put_in_line(walls, edges, most)
-    lines = [wall.line(scale) for wall in walls]
+    obstacles = obstacles_of(edges, [wall.line(scale) for wall in walls])
     for k, wall in enumerate(walls):
         # what it ends on is known once all are drawn
-        ends = directions_beside(wall.border[[0, -1]], obstacles_of(edges, lines, k))
+        ends = directions_beside(wall.border[[0, -1]], obstacles, k)
         walls[k] = dataclasses.replace(wall, runs=_described(wall.border, wall.directions, scale, ends))
         end_outside(walls[k].runs, outline_mm)
     _put_in_line(walls, edges, most)
     for change in (without_stubs, functools.partial(put_through_corner, edges=edges)):
         lines = [wall.line(scale) for wall in walls]
+        obstacles = obstacles_of(edges, lines)
         for k, wall in enumerate(walls):
-            change(wall, met(lines[k], obstacles_of(edges, lines, k), scale), scale)
+            change(wall, met(lines[k], k, obstacles, scale), scale)
     lines = [wall.line(scale) for wall in walls]
-    return [ended(line, obstacles_of(edges, lines, k), scale) for k, line in enumerate(lines)]
+    obstacles = obstacles_of(edges, lines)
+    return [ended(line, k, obstacles, scale) for k, line in enumerate(lines)]
 
 
 def _described(border: FloatArray, directions: FloatArray, scale: Scale, ends: FloatArray = NONE_MET) -> list[Run]:
@@ -198,7 +202,7 @@ def _through(borders: Sequence[FloatArray]) -> list[FloatArray]:
     follows: dict[tuple[int, bool], tuple[int, bool]] = {}
     for meeting in ends.values():
         ways = {end: _way_from(borders[end[0]], end[1]) for end in meeting}
-        pairs = [(float(ways[a] @ ways[b]), a, b) for a, b in itertools.combinations(meeting, 2) if a[0] != b[0]]
+        pairs = [(math.cos(ways[a] - ways[b]), a, b) for a, b in itertools.combinations(meeting, 2) if a[0] != b[0]]
         straightest = min(pairs, default=None)
         if straightest is not None and straightest[0] < _STRAIGHT_ON:
             _, a, b = straightest
@@ -227,33 +231,59 @@ def _through(borders: Sequence[FloatArray]) -> list[FloatArray]:
     return united
 
 
-def _way_from(border: FloatArray, at_start: bool) -> FloatArray:
-    """The unit vector from an end of a border into it."""
-    line = LineString(border if at_start else border[::-1])
-    inner = np.asarray(line.interpolate(min(_WAY_MM, line.length)).coords[0])
-    way = inner - np.asarray(line.coords[0])
-    return np.asarray(way / max(math.hypot(*way.tolist()), 1e-9))
+def _way_from(border: FloatArray, at_start: bool) -> float:
+    """The direction from an end of a border into it, radians."""
+    start = end = tuple(border[0 if at_start else -1].tolist())
+    left, share = _WAY_MM, 0.0
+    for place in (border[1:] if at_start else border[-2::-1]).tolist():
+        before, end, piece = end, place, math.dist(end, place)
+        left -= piece
+        if left <= 0.0:
+            share = left / piece
+            break
+    else:
+        before = end
+    x, y = end[0] + share * (end[0] - before[0]), end[1] + share * (end[1] - before[1])
+    return math.atan2(y - start[1], x - start[0])
 
 
 def _put_in_line(walls: Sequence[Wall], edges: FloatArray, most_mm: float) -> None:
     """Move walls onto the line of a parallel edge, or longer wall, that they nearly continue; the longest first."""
-    middle = 0.5 * (edges[:, :2] + edges[:, 2:])
-    ways = edges[:, 2:] - edges[:, :2]
-    lengths = np.hypot(ways[:, 0], ways[:, 1])
-    long = lengths >= _SHORTEST_MM
-    known = np.column_stack((middle, ways / np.maximum(lengths, 1e-9)[:, None], lengths))[long]
-    for run in sorted((run for wall in walls for run in wall.runs), key=lambda run: (-run.length, run.x, run.y)):
-        ux, uy = math.cos(run.direction), math.sin(run.direction)
-        dx, dy = known[:, 0] - run.x, known[:, 1] - run.y
-        off, along = ux * dy - uy * dx, ux * dx + uy * dy
-        gap = np.abs(along) - 0.5 * (known[:, 4] + run.length)
-        fits = (np.abs(ux * known[:, 3] - uy * known[:, 2]) <= _PARALLEL) & (np.abs(off) <= most_mm)
-        fits &= gap <= _IN_LINE_GAP_MM
-        if fits.any():
-            nearest = float(off[fits][np.argmin(np.abs(off[fits]))])
-            run.x -= nearest * uy
-            run.y += nearest * ux
-        known = np.concatenate((known, [[run.x, run.y, ux, uy, run.length]]))
+    runs = sorted((run for wall in walls for run in wall.runs), key=lambda run: (-run.length, run.x, run.y))
+    lines = np.array([(run.x, run.y, math.cos(run.direction), math.sin(run.direction), run.length) for run in runs])
+    for run, (x, y) in zip(runs, _in_line(edges, lines.reshape(-1, 5), most_mm).tolist(), strict=True):
+        run.x, run.y = x, y
+
+
+@kernel
+def _in_line(edges: FloatArray, lines: FloatArray, most: float) -> FloatArray:
+    """Where the middles of some lines move, (n, 2): onto the nearest of the edges (e, 4) and lines before them.
+
+    Lines (n, 5) are their middle, unit vector and length.
+    """
+    known = np.empty((len(edges) + len(lines), 5))
+    count = 0
+    for e in range(len(edges)):
+        vx, vy = edges[e, 2] - edges[e, 0], edges[e, 3] - edges[e, 1]
+        length = math.hypot(vx, vy)
+        if length >= _SHORTEST_MM:
+            known[count, 0], known[count, 1] = 0.5 * (edges[e, 0] + edges[e, 2]), 0.5 * (edges[e, 1] + edges[e, 3])
+            known[count, 2], known[count, 3], known[count, 4] = vx / length, vy / length, length
+            count += 1
+    for r in range(len(lines)):
+        x, y, ux, uy, length = lines[r]
+        nearest = np.nan
+        for k in range(count):
+            dx, dy = known[k, 0] - x, known[k, 1] - y
+            off, gap = ux * dy - uy * dx, abs(ux * dx + uy * dy) - 0.5 * (known[k, 4] + length)
+            is_parallel = abs(ux * known[k, 3] - uy * known[k, 2]) <= _PARALLEL
+            if is_parallel and abs(off) <= most and gap <= _IN_LINE_GAP_MM and not abs(off) >= abs(nearest):
+                nearest = off
+        known[count] = lines[r]
+        if not np.isnan(nearest):
+            known[count, 0], known[count, 1] = x - nearest * uy, y + nearest * ux
+        count += 1
+    return known[count - len(lines) : count, :2].copy()
 
 
 def _cells(
@@ -296,7 +326,10 @@ def _join_neighbour(k: int, cells: Sequence[Polygon], owners: list[int], tree: s
 
 
 def _is_narrow(cell: Polygon) -> bool:
-    return bool(shapely.is_empty(shapely.buffer(cell, -0.5 * _LEAST_WIDTH_MM)))
+    # a border this far inside takes no more area from it: the rest need not be drawn
+    reach = 0.5 * _LEAST_WIDTH_MM
+    most_mm2 = reach * (cell.length + 0.5 * math.pi * reach * shapely.get_num_coordinates(cell))
+    return bool(cell.area <= most_mm2 and shapely.is_empty(shapely.buffer(cell, -reach)))
 
 
 def _counts(cell: Polygon, xy_mm: IntArray, unit: LabelArray, count: int) -> IntArray:
@@ -305,6 +338,7 @@ def _counts(cell: Polygon, xy_mm: IntArray, unit: LabelArray, count: int) -> Int
     low, high = np.searchsorted(xy_mm[:, 0], [left, right + 1.0])
     xy, of = xy_mm[low:high], unit[low:high]
     inside = (xy[:, 1] >= bottom) & (xy[:, 1] <= top) & (of >= 0)
+    shapely.prepare(cell)
     inside[inside] = shapely.contains_xy(cell, xy[inside].astype(np.float64))
     return np.bincount(of[inside], minlength=count)
 
