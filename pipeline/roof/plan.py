@@ -207,7 +207,7 @@ def _traced_plan(roof: RoofPoints, planes: Sequence[Plane], settings: RoofSettin
     _require_extent(float((high - low).max()) * 1e-3)
     pitch = max(_MIN_PITCH_MM, round(_PITCH_SPACINGS * roof.spacing_m * 1e3))
     gap_m = settings.gap_spacings * roof.spacing_m
-    samples = empty_samples(roof.xy_mm, low, high, pitch, gap_m)
+    samples = empty_samples(roof.xy_mm, low, high, pitch, gap_m, margin if given is None else math.inf)
     frame = _frame(low, high, margin)
     xy_mm = np.concatenate((roof.xy_mm, samples, frame))
     tin = triangulate(xy_mm)

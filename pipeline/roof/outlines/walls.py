@@ -73,28 +73,32 @@ def divided(
     points, `unit` (n,) their units.
     """
     edges = _edges_of(outline_mm)
-    chords = _chords(units, outline_mm, edges, spacing_m)
+    within = shapely.buffer(outline_mm, Scale.of(spacing_m).beyond_mm)
+    chords = _chords(_borders(units, within), outline_mm, edges, spacing_m)
     cells, owners, lost = _cells(outline_mm, chords, xy_mm, unit)
     lost |= set(units.labels.tolist()) - set(owners)
     if lost:
         # a unit that walls do not separate is drawn around its own points
         directions = pairs_of(peaks_of(_edge_runs(edges), 3))
         around = [
-            _drawn_around(polygon.exterior, directions, spacing_m)
+            _drawn_around(part.exterior, directions, spacing_m)
             for polygon, label in zip(units.polygons, units.labels.tolist(), strict=True)
             if label in lost
+            for part in polygons_of(shapely.intersection(polygon, within))
         ]
         cells, owners, _ = _cells(outline_mm, [*chords, *around], xy_mm, unit)
     return _united(cells, owners)
 
 
-def _chords(units: RoofPartition, outline_mm: MultiPolygon, edges: FloatArray, spacing_m: float) -> list[FloatArray]:
-    """The walls between units, (n, 2) each; their ends lie on the outline, edges (e, 4), or on other walls."""
+def _chords(
+    borders: Sequence[FloatArray], outline_mm: MultiPolygon, edges: FloatArray, spacing_m: float
+) -> list[FloatArray]:
+    """The walls along borders between units, (n, 2) each; they end on the outline, edges (e, 4), or on other walls."""
     scale = Scale.of(spacing_m)
     most = max(_IN_LINE_MM, scale.spacing_mm)
     walls = []
     pieces = shapely.linestrings(edges.reshape(-1, 2, 2))
-    for border in _through(_borders(units, shapely.buffer(outline_mm, scale.beyond_mm))):
+    for border in _through(borders):
         near = edges[shapely.distance(LineString(border), pieces) <= _NEARBY_MM]
         directions = pairs_of(peaks_of(_edge_runs(near)))
         walls.append(Wall(border, directions, _described(border, directions, scale)))
@@ -146,32 +150,28 @@ def _edge_runs(edges: FloatArray) -> list[Run]:
 
 
 def _borders(units: RoofPartition, within: Polygon | MultiPolygon) -> list[FloatArray]:
-    """The borders between two units, (n, 2) each, as far as they lie within an area."""
-    polygons = np.array(units.polygons, dtype=object)
-    whole = [shapely.coverage_union_all(polygons[units.labels == number]) for number in np.unique(units.labels)]
-    borders: list[FloatArray] = []
-    for stretches in _stretches(whole):
+    """The borders between two units, (n, 2) each, as far as they lie within an area; from the end in the west on."""
+    borders: list[list[list[float]]] = []
+    for stretches in _stretches(units):
         common = shapely.line_merge(shapely.intersection(shapely.multilinestrings(stretches), within))
-        borders += [
-            np.asarray(line.coords)
-            for line in shapely.get_parts(common)
-            if isinstance(line, LineString) and line.length > _SHORTEST_MM
-        ]
-    return borders
+        for line in shapely.get_parts(common).tolist():
+            if isinstance(line, LineString) and line.length > _SHORTEST_MM:
+                places = shapely.get_coordinates(line).tolist()
+                borders.append(places if places[0] <= places[-1] else places[::-1])
+    return [np.array(border) for border in sorted(borders)]
 
 
-def _stretches(shapes: Sequence[Polygon | MultiPolygon]) -> list[list[LineString]]:
-    """The lines that each two shapes of a coverage share, pair by pair: as the first one has them on its rings.
+def _stretches(units: RoofPartition) -> list[list[LineString]]:
+    """The lines that each two units of a partition share, pair by pair: as the first one has them on its rings.
 
-    Shapes of a coverage have the same edges where they meet, which makes an overlay needless. A closed line begins at
+    Faces of a partition have the same edges where they meet, which makes an overlay needless. A closed line begins at
     its westernmost vertex.
     """
-    parts, of_part = shapely.get_parts(np.array(shapes, dtype=object), return_index=True)
-    rings, of_ring = shapely.get_rings(parts, return_index=True)
+    rings, of_ring = shapely.get_rings(units.polygons, return_index=True)
     xy, ring = shapely.get_coordinates(rings, return_index=True)
     inside = ring[:-1] == ring[1:]
     start, end, ring = xy[:-1][inside], xy[1:][inside], ring[:-1][inside]
-    own = of_part[of_ring[ring]]
+    own = units.labels[of_ring[ring]]
     is_turned = (start[:, 0] > end[:, 0]) | ((start[:, 0] == end[:, 0]) & (start[:, 1] > end[:, 1]))
     edges = np.where(is_turned[:, None], np.column_stack((end, start)), np.column_stack((start, end)))
     order = np.lexsort((own, *edges.T))
