@@ -17,6 +17,7 @@ import math
 from collections.abc import Iterable, Sequence
 
 import numpy as np
+import numpy.typing as npt
 import shapely
 from shapely import LineString, MultiPolygon, Polygon
 
@@ -150,22 +151,22 @@ def _edge_runs(edges: FloatArray) -> list[Run]:
 
 
 def _borders(units: RoofPartition, within: Polygon | MultiPolygon) -> list[FloatArray]:
-    """The borders between two units, (n, 2) each, as far as they lie within an area; from the end in the west on."""
+    """The borders between two units, (n, 2) each, as far as they lie within an area; each begins in the west."""
     borders: list[list[list[float]]] = []
-    for stretches in _stretches(units):
-        common = shapely.line_merge(shapely.intersection(shapely.multilinestrings(stretches), within))
-        for line in shapely.get_parts(common).tolist():
-            if isinstance(line, LineString) and line.length > _SHORTEST_MM:
-                places = shapely.get_coordinates(line).tolist()
-                borders.append(places if places[0] <= places[-1] else places[::-1])
+    for line in shapely.get_parts(shapely.line_merge(shapely.intersection(_common_lines(units), within))).tolist():
+        if isinstance(line, LineString) and line.length > _SHORTEST_MM:
+            places = shapely.get_coordinates(line).tolist()
+            if places[0] == places[-1]:
+                west = places.index(min(places))
+                places = [*places[west:-1], *places[: west + 1]]
+            borders.append(places if places[0] <= places[-1] else places[::-1])
     return [np.array(border) for border in sorted(borders)]
 
 
-def _stretches(units: RoofPartition) -> list[list[LineString]]:
-    """The lines that each two units of a partition share, pair by pair: as the first one has them on its rings.
+def _common_lines(units: RoofPartition) -> npt.NDArray[np.object_]:
+    """The lines that each two units of a partition share, pair by pair, as the first one has them on its rings.
 
-    Faces of a partition have the same edges where they meet, which makes an overlay needless. A closed line begins at
-    its westernmost vertex.
+    Faces of a partition have the same edges where they meet, which makes an overlay needless.
     """
     rings, of_ring = shapely.get_rings(units.polygons, return_index=True)
     xy, ring = shapely.get_coordinates(rings, return_index=True)
@@ -179,16 +180,17 @@ def _stretches(units: RoofPartition) -> list[list[LineString]]:
     edge, other = order[twin], own[order[twin + 1]]
     order = np.lexsort((edge, other, own[edge]))
     edge, other = edge[order], other[order]
-    goes_on = (np.diff(edge) == 1) & (np.diff(ring[edge]) == 0) & (np.diff(other) == 0)
-    found: dict[tuple[int, int], list[LineString]] = {}
-    for stretch in np.split(np.arange(len(edge)), np.flatnonzero(~goes_on) + 1):
-        if len(stretch):
-            line = np.concatenate((start[edge[stretch]], end[edge[stretch[-1:]]]))
-            if (line[0] == line[-1]).all():
-                first = int(np.lexsort(line[:-1, ::-1].T)[0])
-                line = np.concatenate((line[first:-1], line[: first + 1]))
-            found.setdefault((int(own[edge[stretch[0]]]), int(other[stretch[0]])), []).append(LineString(line))
-    return list(found.values())
+    if len(edge) == 0:
+        return np.empty(0, object)
+    new_pair = (np.diff(own[edge], prepend=-1) != 0) | (np.diff(other, prepend=-1) != 0)
+    new_line = new_pair | (np.diff(edge, prepend=-2) != 1) | (np.diff(ring[edge], prepend=-1) != 0)
+    # a line has the starts of all its edges, and the end of the last
+    firsts = np.flatnonzero(new_line)
+    stops = np.append(firsts[1:], len(edge))
+    places = np.insert(start[edge], stops, end[edge[stops - 1]], axis=0)
+    lines = shapely.linestrings(places, indices=np.repeat(np.arange(len(firsts)), stops - firsts + 1))
+    pairs: npt.NDArray[np.object_] = shapely.multilinestrings(lines, indices=np.cumsum(new_pair[firsts]) - 1)
+    return pairs
 
 
 def _through(borders: Sequence[FloatArray]) -> list[FloatArray]:
