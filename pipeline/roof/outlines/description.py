@@ -112,21 +112,6 @@ def _own_direction(sxx: float, sxy: float, syy: float, root: float) -> tuple[flo
     return math.sqrt(max(0.5 + half, 0.0)), math.copysign(math.sqrt(max(0.5 - half, 0.0)), sxy)
 
 
-@kernel
-def _in_directions(
-    ux: FloatArray, uy: FloatArray, xy: FloatArray, sums: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Places (m, 2) along each direction, and the first and second moments of `_moments` across it; (d, m) each."""
-    along, across, squares = np.empty((len(ux), len(xy))), np.empty((len(ux), len(xy))), np.empty((len(ux), len(xy)))
-    for k in range(len(ux)):
-        a, b = ux[k], uy[k]
-        for j in range(len(xy)):
-            along[k, j] = a * xy[j, 0] + b * xy[j, 1]
-            across[k, j] = a * sums[j, 2] - b * sums[j, 1]
-            squares[k, j] = a * a * sums[j, 5] - 2.0 * a * b * sums[j, 4] + b * b * sums[j, 3]
-    return along, across, squares
-
-
 @kernel(inline="always")
 def _kept(live: IntArray, costs: FloatArray, most: float) -> int:
     """Leave out the starts that cost more than the most; the number of those that stay, and one that may follow."""
@@ -179,8 +164,10 @@ def least_description(
     xy = border[breaks % len(border)]
     sums = _moments(border, breaks)
     turns = _turns(directions, prices)
-    ux, uy = np.cos(directions), np.sin(directions)
-    along, across, squares = _in_directions(ux, uy, xy, sums)
+    # along each direction the places, across it the first and second moments
+    ux, uy = np.cos(directions).reshape(-1, 1), np.sin(directions).reshape(-1, 1)
+    along, across = ux * xy[:, 0] + uy * xy[:, 1], ux * sums[:, 2] - uy * sums[:, 1]
+    squares = ux * ux * sums[:, 5] - 2.0 * ux * uy * sums[:, 4] + uy * uy * sums[:, 3]
     # the best description up to each break that ends in a state; the best before an edge that begins in a state
     best = np.full((m, free + 1), np.inf)
     start = np.full((m, free + 1), -1, np.int64)
@@ -207,7 +194,7 @@ def least_description(
                     continue
                 if k < d:
                     way, mean = along[k, j] - along[k, i], across[k, j] - across[k, i]
-                    vx, vy = ux[k], uy[k]
+                    vx, vy = ux[k, 0], uy[k, 0]
                     state = 2 * k if way >= 0.0 else 2 * k + 1
                     off = squares[k, j] - squares[k, i] - mean * mean / w
                     costs[k, p] = before[i, state] + per_mm * max(off, 0.0)

@@ -12,23 +12,46 @@ from collections.abc import Iterable
 
 import numpy as np
 import shapely
+from shapely import Polygon
 
 from pipeline.compiler import kernel
 from pipeline.model import FloatArray
+from pipeline.roof.edge_position import EdgePoints
 from pipeline.roof.lines import Run
 from pipeline.roof.outlines.description import SHARP
+from pipeline.roof.outlines.exterior import FEWEST, MOVED, PRICES, Ring, described, pairs_of, ring_of, runs_of
 
 _OFF_MM = 120.0
 """Standard deviation of a point about the edge that it lies outside of."""
 _MOST = 8.0
 """Most that a point outside costs, nats: it may be no roof."""
 _STEP = math.radians(5.0)
-"""Between the directions that are tried."""
+"""Between the directions that are tried, modulo a right angle."""
 
 
-def directions() -> FloatArray:
-    """The directions that are tried, modulo a right angle, radians."""
-    return np.arange(0.0, 0.5 * math.pi, _STEP)
+def of_few_points(ring: Ring, points: EdgePoints, noise_mm: float, least_mm: float) -> FloatArray | None:
+    """The likeliest ring around few points: as described, or in two directions of any; no edge shorter than some."""
+    raw, spacing_mm = Polygon(ring.border), points.spacing_mm
+    area_mm2, most_mm2 = raw.area, 4.0 * MOVED * noise_mm * raw.length
+    xy_mm = points.xy_mm.astype(np.float64)
+    xy_mm = xy_mm[shapely.contains_xy(shapely.buffer(raw, spacing_mm), xy_mm)]
+    per_mm = 0.5 / (spacing_mm * noise_mm * noise_mm)
+    square = PRICES._replace(free=PRICES.sharp)
+    ways = described([ring], spacing_mm, noise_mm)
+    for angle in np.arange(0.0, 0.5 * math.pi, _STEP).tolist():
+        ways.append((ring.border, runs_of(ring, pairs_of([angle]), per_mm, square)[0]))
+    drawings: list[tuple[float, FloatArray]] = []
+    for along, runs in ways:
+        for run in runs:
+            shift = envelope_mm(run, xy_mm, area_mm2, 1.5 * spacing_mm)
+            run.x += shift * math.sin(run.direction)
+            run.y -= shift * math.cos(run.direction)
+        found = ring_of(along, runs, least_mm, most_mm2) if len(runs) >= FEWEST else None
+        if found is not None:
+            free = sum(not run.exact for run in runs)
+            cost = PRICES.edge * len(found) + PRICES.free * free + PRICES.sharp * sharp_corners(found)
+            drawings.append((cost, found))
+    return likeliest(drawings, xy_mm, spacing_mm)
 
 
 def envelope_mm(run: Run, xy_mm: FloatArray, area_mm2: float, out_mm: float) -> float:
@@ -84,7 +107,7 @@ def sharp_corners(ring: FloatArray) -> int:
     return int(np.count_nonzero(cosine < SHARP * lengths * np.roll(lengths, -1)))
 
 
-def likeliest(drawings: Iterable[tuple[float, FloatArray]], xy_mm: FloatArray, spacing_m: float) -> FloatArray | None:
+def likeliest(drawings: Iterable[tuple[float, FloatArray]], xy_mm: FloatArray, spacing_mm: float) -> FloatArray | None:
     """The ring of least cost among some with the cost of their edges; points (n, 2); None where there are none."""
     best, least = None, math.inf
     places = shapely.points(xy_mm)
@@ -94,7 +117,7 @@ def likeliest(drawings: Iterable[tuple[float, FloatArray]], xy_mm: FloatArray, s
         if area <= 0.0 or not shapely.is_valid(polygon):
             continue
         off = shapely.distance(places, polygon)
-        total = cost + len(xy_mm) * math.log(area / (1e3 * spacing_m) ** 2)
+        total = cost + len(xy_mm) * math.log(area / spacing_mm**2)
         total += float(np.minimum(0.5 * (off / _OFF_MM) ** 2, _MOST).sum())
         if total < least:
             best, least = ring, total
