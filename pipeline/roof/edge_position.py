@@ -117,7 +117,7 @@ class EdgePoints:
             rows=rows,
             cell_mm=cell,
             spacing_mm=spacing_m * 1e3,
-            nearest_mm=nearest_distance(xy_mm) if nearest_m is None else 1e3 * nearest_m,
+            nearest_mm=nearest_distance(xy_mm.astype(np.float64)) if nearest_m is None else 1e3 * nearest_m,
         )
 
     @property

@@ -41,7 +41,7 @@ _FACTORS = (1.0, 0.6, 0.35)
 """Times the noise: an outline that cannot be drawn with few edges is tried with more."""
 _FEW_POINTS, _FEW_SPACING_M = 150, 2.0
 """So few points, so far apart, show directions badly: outlines in all directions are compared."""
-FEWEST, _FEW_BREAKS = 4, 60
+_FEWEST, _FEW_BREAKS = 4, 60
 """A ring of so few breaks has four edges at least."""
 _APART = math.radians(8.0)
 """Two pairs of common directions differ by more."""
@@ -62,7 +62,7 @@ _NOISE_OF_SIZE = 0.035
 """Small houses show finer edges: their least noise is this part of the square root of their area."""
 _LEAST_SPACINGS, _LEAST_M = 0.75, 0.3
 """Shorter edges are left out: in point spacings, and at least."""
-MOVED = 1.2
+_MOVED = 1.2
 """Most area between the raw outline and the edges: this many standard deviations of it times its length."""
 _SAME = math.cos(math.radians(3.0))
 _QUARTER = 0.5 * math.pi
@@ -71,7 +71,7 @@ NONE_MET = np.full(2, np.nan)
 
 
 @dataclasses.dataclass(frozen=True)
-class Ring:
+class _Ring:
     """A ring of the raw outline."""
 
     border: FloatArray
@@ -130,22 +130,20 @@ def _straight_rings(
     drawn: list[FloatArray | None] = [None] * len(borders)
     least_mm = min(max(_NOISE_OF_SIZE * math.sqrt(polygon.area), 100.0), noise_m[1] * 1e3)
     noise_mm = max(noise_m[0] * 1e3, least_mm)
-    rings = [Ring(border, breaks_of(border, _BREAK_SPACINGS * spacing_m * 1e3)) for border in borders]
+    rings = [_Ring(border, breaks_of(border, _BREAK_SPACINGS * spacing_m * 1e3)) for border in borders]
     least = max(_LEAST_SPACINGS * spacing_m, _LEAST_M) * 1e3
     if points is not None and len(points.xy_mm) <= _FEW_POINTS and spacing_m >= _FEW_SPACING_M:
-        from pipeline.roof.outlines.few_points import of_few_points
-
-        drawn[0] = of_few_points(rings[0], points, noise_mm, least)
+        drawn[0] = _of_few_points(rings[0], points, noise_mm, least)
     for factor in _FACTORS:
         if all(ring is not None for ring in drawn):
             break
         for k, (border, runs) in enumerate(described(rings, spacing_m * 1e3, factor * noise_mm)):
             if drawn[k] is None and len(runs) > 2:
-                beside_mm = MOVED * Polygon(border).length
-                drawn[k] = ring_of(border, runs, least, beside_mm * noise_mm)
+                beside_mm = _MOVED * Polygon(border).length
+                drawn[k] = _ring_of(border, runs, least, beside_mm * noise_mm)
                 if drawn[k] is not None and points is not None:
                     _take_positions(border, runs, points, reach_mm)
-                    moved = ring_of(border, runs, least, beside_mm * (noise_mm + points.spacing_mm))
+                    moved = _ring_of(border, runs, least, beside_mm * (noise_mm + points.spacing_mm))
                     drawn[k] = drawn[k] if moved is None else moved
     return [raw if ring is None else ring for raw, ring in zip(borders, drawn, strict=True)]
 
@@ -159,7 +157,21 @@ def _evenness(outline_mm: MultiPolygon, points: EdgePoints | None) -> float:
     return math.pow(min(max(points.nearest_mm / (_NEAREST * spacing_mm), 1.0), _EVENEST), _EVEN_POWER)
 
 
-def described(rings: Sequence[Ring], spacing_mm: float, noise_mm: float) -> list[tuple[FloatArray, list[Run]]]:
+def _of_few_points(ring: _Ring, points: EdgePoints, noise_mm: float, least_mm: float) -> FloatArray | None:
+    """The likeliest ring around few points: as described, or in two directions of any."""
+    from pipeline.roof.outlines.few_points import directions, likeliest
+
+    raw, per_mm = Polygon(ring.border), 0.5 / (points.spacing_mm * noise_mm * noise_mm)
+    ways, square = described([ring], points.spacing_mm, noise_mm), PRICES._replace(free=PRICES.sharp)
+    ways += [(ring.border, _runs(ring, pairs_of([angle]), per_mm, square)[0]) for angle in directions().tolist()]
+
+    def drawn(border: FloatArray, runs: Sequence[Run]) -> FloatArray | None:
+        return _ring_of(border, runs, least_mm, 4.0 * _MOVED * noise_mm * raw.length) if len(runs) >= _FEWEST else None
+
+    return likeliest(ways, drawn, raw, points, PRICES)
+
+
+def described(rings: Sequence[_Ring], spacing_mm: float, noise_mm: float) -> list[tuple[FloatArray, list[Run]]]:
     """The edges of some rings, which share their directions: those of the shortest description of all of them.
 
     With the vertices of each ring, which begins anew at a corner.
@@ -167,10 +179,10 @@ def described(rings: Sequence[Ring], spacing_mm: float, noise_mm: float) -> list
     per_mm = 0.5 / (spacing_mm * noise_mm * noise_mm)
     alone = PRICES._replace(free=_FREE_ALONE)
     none = np.empty(0)
-    runs = [runs_of(ring, none, per_mm, alone)[0] for ring in rings]
+    runs = [_runs(ring, none, per_mm, alone)[0] for ring in rings]
     rings = [_begun_at_a_corner(ring, own) for ring, own in zip(rings, runs, strict=True)]
     tried = peaks_of([run for own in runs for run in own])
-    found = [runs_of(ring, none, per_mm, PRICES) for ring in rings]
+    found = [_runs(ring, none, per_mm, PRICES) for ring in rings]
     least, best = math.fsum(cost for _, cost in found), [own for own, _ in found]
     systems: list[float] = []
     while len(systems) < _SYSTEMS:
@@ -180,7 +192,7 @@ def described(rings: Sequence[Ring], spacing_mm: float, noise_mm: float) -> list
                 continue
             more = [*systems, angle]
             for is_last in (False, True):
-                found = [runs_of(ring, pairs_of(more), per_mm, PRICES) for ring in rings]
+                found = [_runs(ring, pairs_of(more), per_mm, PRICES) for ring in rings]
                 cost = math.fsum(own_cost for _, own_cost in found) + _SYSTEM * len(more)
                 if better is None or cost < better[0]:
                     better = cost, more, [own for own, _ in found]
@@ -193,17 +205,17 @@ def described(rings: Sequence[Ring], spacing_mm: float, noise_mm: float) -> list
         if len(own) > 2 and math.cos(own[0].direction - own[-1].direction) < SHARP:
             # a spike where the ring begins is the only one without a price
             rings[k] = _begun_at_a_corner(rings[k], own)
-            best[k] = runs_of(rings[k], pairs_of(systems), per_mm, PRICES)[0]
+            best[k] = _runs(rings[k], pairs_of(systems), per_mm, PRICES)[0]
         ring = rings[k]
-        if len(best[k]) < FEWEST and len(ring.breaks) <= _FEW_BREAKS:
+        if len(best[k]) < _FEWEST and len(ring.breaks) <= _FEW_BREAKS:
             # a few points never show a triangle: it is the cheapest way to cut the corners of a rectangle
             longest = max(best[k], key=lambda run: run.length).direction if best[k] else 0.0
-            best[k] = runs_of(ring, pairs_of([longest]), per_mm, PRICES._replace(free=PRICES.sharp))[0]
+            best[k] = _runs(ring, pairs_of([longest]), per_mm, PRICES._replace(free=PRICES.sharp))[0]
     return [(ring.border, own) for ring, own in zip(rings, best, strict=True)]
 
 
-def runs_of(
-    ring: Ring, directions: FloatArray, per_mm: float, prices: Prices, met: FloatArray = NONE_MET
+def _runs(
+    ring: _Ring, directions: FloatArray, per_mm: float, prices: Prices, met: FloatArray = NONE_MET
 ) -> tuple[list[Run], float]:
     """The edges of a ring, and the length of their description."""
     ends, of_edge, angles, cost = least_description(ring.border, ring.breaks, directions, per_mm, prices, met)
@@ -226,7 +238,7 @@ def described_chain(
     breaks = breaks_of(border, step)[:-1]
     breaks = np.append(breaks[:-1] if len(breaks) > 1 else breaks, len(border) - 1)
     per_mm = 0.5 / (spacing_mm * noise_mm * noise_mm)
-    return runs_of(Ring(border=border, breaks=breaks), directions, per_mm, prices, met)[0]
+    return _runs(_Ring(border=border, breaks=breaks), directions, per_mm, prices, met)[0]
 
 
 def pairs_of(systems: Sequence[float]) -> FloatArray:
@@ -290,7 +302,7 @@ def breaks_of(border: FloatArray, step: float) -> IntArray:
     return breaks[: count + 1].copy()
 
 
-def _begun_at_a_corner(ring: Ring, runs: Sequence[Run]) -> Ring:
+def _begun_at_a_corner(ring: _Ring, runs: Sequence[Run]) -> _Ring:
     """The same ring from its clearest corner on: where a description begins, it has a corner."""
     if len(runs) < 3:
         return ring
@@ -299,7 +311,7 @@ def _begun_at_a_corner(ring: Ring, runs: Sequence[Run]) -> Ring:
     first = runs[1 + max(range(len(clear)), key=clear.__getitem__)].first % len(ring.border)
     n = len(ring.border)
     turned = np.sort((ring.breaks[:-1] - first) % n)
-    return Ring(border=np.concatenate((ring.border[first:], ring.border[:first])), breaks=np.append(turned, n))
+    return _Ring(border=np.concatenate((ring.border[first:], ring.border[:first])), breaks=np.append(turned, n))
 
 
 def _take_positions(border: FloatArray, runs: Sequence[Run], points: EdgePoints, reach_mm: float) -> None:
@@ -380,7 +392,7 @@ def _turned(ring: FloatArray, is_hole: bool) -> FloatArray:
     return np.concatenate((turned[start:], turned[:start]))
 
 
-def ring_of(border: FloatArray, runs: Sequence[Run], least_mm: float, most_mm2: float) -> FloatArray | None:
+def _ring_of(border: FloatArray, runs: Sequence[Run], least_mm: float, most_mm2: float) -> FloatArray | None:
     """A sound ring through the corners of edges, if no more lies between it and the raw one; loops at corners go."""
     copies = [Run(**vars(run)) for run in runs]
     places = corners(border, without_short(border, copies, least_mm), math.inf, closed=True)

@@ -8,7 +8,7 @@ distance is worth, and edges what they cost in a description.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 import shapely
@@ -18,40 +18,19 @@ from pipeline.compiler import kernel
 from pipeline.model import FloatArray
 from pipeline.roof.edge_position import EdgePoints
 from pipeline.roof.lines import Run
-from pipeline.roof.outlines.description import SHARP
-from pipeline.roof.outlines.exterior import FEWEST, MOVED, PRICES, Ring, described, pairs_of, ring_of, runs_of
+from pipeline.roof.outlines.description import SHARP, Prices
 
 _OFF_MM = 120.0
 """Standard deviation of a point about the edge that it lies outside of."""
 _MOST = 8.0
 """Most that a point outside costs, nats: it may be no roof."""
 _STEP = math.radians(5.0)
-"""Between the directions that are tried, modulo a right angle."""
+"""Between the directions that are tried."""
 
 
-def of_few_points(ring: Ring, points: EdgePoints, noise_mm: float, least_mm: float) -> FloatArray | None:
-    """The likeliest ring around few points: as described, or in two directions of any; no edge shorter than some."""
-    raw, spacing_mm = Polygon(ring.border), points.spacing_mm
-    area_mm2, most_mm2 = raw.area, 4.0 * MOVED * noise_mm * raw.length
-    xy_mm = points.xy_mm.astype(np.float64)
-    xy_mm = xy_mm[shapely.contains_xy(shapely.buffer(raw, spacing_mm), xy_mm)]
-    per_mm = 0.5 / (spacing_mm * noise_mm * noise_mm)
-    square = PRICES._replace(free=PRICES.sharp)
-    ways = described([ring], spacing_mm, noise_mm)
-    for angle in np.arange(0.0, 0.5 * math.pi, _STEP).tolist():
-        ways.append((ring.border, runs_of(ring, pairs_of([angle]), per_mm, square)[0]))
-    drawings: list[tuple[float, FloatArray]] = []
-    for along, runs in ways:
-        for run in runs:
-            shift = envelope_mm(run, xy_mm, area_mm2, 1.5 * spacing_mm)
-            run.x += shift * math.sin(run.direction)
-            run.y -= shift * math.cos(run.direction)
-        found = ring_of(along, runs, least_mm, most_mm2) if len(runs) >= FEWEST else None
-        if found is not None:
-            free = sum(not run.exact for run in runs)
-            cost = PRICES.edge * len(found) + PRICES.free * free + PRICES.sharp * sharp_corners(found)
-            drawings.append((cost, found))
-    return likeliest(drawings, xy_mm, spacing_mm)
+def directions() -> FloatArray:
+    """The directions that are tried, modulo a right angle, radians."""
+    return np.arange(0.0, 0.5 * math.pi, _STEP)
 
 
 def envelope_mm(run: Run, xy_mm: FloatArray, area_mm2: float, out_mm: float) -> float:
@@ -107,17 +86,33 @@ def sharp_corners(ring: FloatArray) -> int:
     return int(np.count_nonzero(cosine < SHARP * lengths * np.roll(lengths, -1)))
 
 
-def likeliest(drawings: Iterable[tuple[float, FloatArray]], xy_mm: FloatArray, spacing_mm: float) -> FloatArray | None:
-    """The ring of least cost among some with the cost of their edges; points (n, 2); None where there are none."""
-    best, least = None, math.inf
+def likeliest(
+    ways: Iterable[tuple[FloatArray, list[Run]]],
+    drawn: Callable[[FloatArray, list[Run]], FloatArray | None],
+    raw: Polygon,
+    points: EdgePoints,
+    prices: Prices,
+) -> FloatArray | None:
+    """The ring of least cost among those that are drawn with some edges of a border, after the points moved them.
+
+    `raw` is the ring before; None where none can be drawn.
+    """
+    best, least, spacing_mm = None, math.inf, points.spacing_mm
+    xy_mm = points.xy_mm.astype(np.float64)
+    xy_mm = xy_mm[shapely.contains_xy(shapely.buffer(raw, spacing_mm), xy_mm)]
     places = shapely.points(xy_mm)
-    for cost, ring in drawings:
-        polygon = shapely.polygons(ring)
-        area = float(shapely.area(polygon))
-        if area <= 0.0 or not shapely.is_valid(polygon):
+    for border, runs in ways:
+        for run in runs:
+            shift = envelope_mm(run, xy_mm, raw.area, 1.5 * spacing_mm)
+            run.x += shift * math.sin(run.direction)
+            run.y -= shift * math.cos(run.direction)
+        ring = drawn(border, runs)
+        polygon = None if ring is None else shapely.polygons(ring)
+        if ring is None or polygon is None or polygon.area <= 0.0 or not polygon.is_valid:
             continue
+        total = prices.edge * len(ring) + prices.free * sum(not run.exact for run in runs)
         off = shapely.distance(places, polygon)
-        total = cost + len(xy_mm) * math.log(area / spacing_mm**2)
+        total += prices.sharp * sharp_corners(ring) + len(xy_mm) * math.log(polygon.area / spacing_mm**2)
         total += float(np.minimum(0.5 * (off / _OFF_MM) ** 2, _MOST).sum())
         if total < least:
             best, least = ring, total
