@@ -227,13 +227,13 @@ def spacing_over_area_m(points: FloatArray) -> float:
     than 1.3 times that over the points, else `point_spacing_m`: with one density they differ by less than a quarter,
     borders included (measured on simulated and real roofs of 1 to 30 points per m2).
     """
-    usual, over_area = _spacings(_plan(points))
+    usual, over_area, _ = _spacings(_plan(points))
     return over_area if over_area > _UNEVEN * usual else usual
 
 
 def nearest_distance(points: FloatArray) -> float:
-    """Median distance of points (n, 2), n > 0, from the nearest other one; infinite for a single one."""
-    return math.sqrt(float(np.median(_nearest_neighbours(points, 1, 0.0, False)[1])))
+    """Median distance in plan of points, at least one, from the nearest other one; infinite for a single one."""
+    return _spacings(_plan(points))[2]
 
 
 def _plan(points: FloatArray) -> bytes:
@@ -242,23 +242,26 @@ def _plan(points: FloatArray) -> bytes:
 
 
 @functools.lru_cache(maxsize=1)
-def _spacings(plan: bytes) -> tuple[float, float]:
+def _spacings(plan: bytes) -> tuple[float, float, float]:
     """1 / sqrt(density) of `_plan`, by medians over the points and over their area; nan for fewer than two points.
 
-    Cached, since the points of a roof are mostly all that see the sky, whose spacing is asked for next.
+    With the median distance from the nearest one. Cached: one search serves all three, and the points of a roof are
+    mostly all that see the sky, whose spacing is asked for next.
     """
     points = np.frombuffer(plan).reshape(-1, 2).copy()
     n = len(points)
     k = min(_SPACING_NEIGHBOURS, n - 1)
     if k < 1:
-        return math.nan, math.nan
-    squares = np.sort(_nearest_neighbours(points, k, 0.0, False)[1][:, k - 1])
+        return math.nan, math.nan, math.inf
+    found = _nearest_neighbours(points, k, 0.0, False)[1]
+    nearest = math.sqrt(float(np.median(found[:, 0])))
+    squares = np.sort(found[:, k - 1])
     median = 0.5 * float(squares[(n - 1) // 2] + squares[n // 2])
     covered = np.cumsum(squares)
     middle = float(squares[min(int(np.searchsorted(covered, 0.5 * covered[-1])), n - 1)])
     # pi density r_k^2 is Gamma(k) distributed; its median is k - 1/3 within 2 % for k >= 1; weighted with itself a
     # Gamma(k) variate is Gamma(k + 1) distributed
-    return math.sqrt(median * math.pi / (k - 1.0 / 3.0)), math.sqrt(middle * math.pi / (k + 2.0 / 3.0))
+    return math.sqrt(median * math.pi / (k - 1.0 / 3.0)), math.sqrt(middle * math.pi / (k + 2.0 / 3.0)), nearest
 
 
 @kernel

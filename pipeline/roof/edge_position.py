@@ -97,10 +97,11 @@ class EdgePoints:
     """Median distance from the nearest point."""
 
     @classmethod
-    def of(cls, xy_mm: IntArray, split: BoolArray, spacing_m: float) -> EdgePoints:
+    def of(cls, xy_mm: IntArray, split: BoolArray, spacing_m: float, nearest_m: float | None = None) -> EdgePoints:
         """Sort at least one point (n, 2), in millimetres, into cells of some point spacings.
 
-        `split` is True where the pulse went on to a lower return; all False where the file does not record it.
+        `split` is True where the pulse went on to a lower return; all False where the file does not record it. The
+        median distance from the nearest point is searched for unless it is known.
         """
         cell = max(1000, math.ceil(_DEPTH_SPACINGS * spacing_m * 1e3))
         low, high = bounds_of(np.ascontiguousarray(xy_mm, dtype=np.int64))
@@ -116,7 +117,7 @@ class EdgePoints:
             rows=rows,
             cell_mm=cell,
             spacing_mm=spacing_m * 1e3,
-            nearest_mm=nearest_distance(np.ascontiguousarray(xy_mm, dtype=np.float64)),
+            nearest_mm=nearest_distance(xy_mm.astype(np.float64)) if nearest_m is None else 1e3 * nearest_m,
         )
 
     @property

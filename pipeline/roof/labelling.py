@@ -32,45 +32,55 @@ def fill_labels(xy_mm: IntArray, labels: LabelArray) -> LabelArray:
 
 
 @kernel
-def _far_samples(xy: IntArray, low: IntArray, shape: tuple[int, int], pitch: int, gap_m: float) -> IntArray:
-    """The samples (s, 2) of a lattice, row after row, that lie farther than a gap from every point (n, 2).
+def _far_samples(
+    xy: IntArray, low: IntArray, shape: tuple[int, int], pitch: int, gap_m: float, beside: int
+) -> IntArray:
+    """The samples (s, 2) of a lattice, row after row, farther than a gap from every point (n, 2), `beside` some.
 
     It has some rows and columns from its lower left corner on. Every other row is shifted by half a pitch: an
     equilateral lattice has no ties for the Delaunay triangulation.
     """
     rows, columns = shape
     near = np.zeros((rows, columns), np.bool_)
+    holds, is_beside = np.zeros((rows, columns), np.bool_), np.full((rows, columns), beside < 0)
     reach = math.ceil(gap_m * 1e3)
     for i in range(len(xy)):
         x, y = xy[i, 0] - low[0], xy[i, 1] - low[1]
+        r, c = y // pitch, x // pitch
+        if beside >= 0 and not holds[r, c]:
+            holds[r, c] = True
+            is_beside[max(r - beside, 0) : r + beside + 1, max(c - beside, 0) : c + beside + 1] = True
         for r in range(max((y - reach) // pitch, 0), min((y + reach) // pitch + 1, rows)):
             shift = (r & 1) * (pitch // 2)
             dy = r * pitch - y
             for c in range(max((x - shift - reach) // pitch, 0), min((x - shift + reach) // pitch + 1, columns)):
                 dx = c * pitch + shift - x
                 near[r, c] |= math.sqrt(dx * dx + dy * dy) * 1e-3 <= gap_m
-    samples = np.empty((rows * columns - near.sum(), 2), np.int64)
+    samples = np.empty((is_beside.sum(), 2), np.int64)
     count = 0
     for r in range(rows):
         for c in range(columns):
-            if not near[r, c]:
+            if is_beside[r, c] and not near[r, c]:
                 samples[count, 0] = low[0] + c * pitch + (r & 1) * (pitch // 2)
                 samples[count, 1] = low[1] + r * pitch
                 count += 1
-    return samples
+    return samples[:count].copy()
 
 
-def empty_samples(xy_mm: IntArray, low: IntArray, high: IntArray, pitch_mm: int, gap_m: float) -> IntArray:
+def empty_samples(
+    xy_mm: IntArray, low: IntArray, high: IntArray, pitch_mm: int, gap_m: float, reach_mm: float = math.inf
+) -> IntArray:
     """Lattice samples around and between the points, where no point is near.
 
     The lattice between the corners `low` and `high` starts at the lower left one, so it moves with the points. Samples
     are `pitch_mm` apart, more where it would give more than a million of them; those nearer to a point than `gap_m` are
-    dropped. Returns the samples, (s, 2) in millimetres.
+    dropped, and those about `reach_mm` beyond any. Returns the samples, (s, 2) in millimetres.
     """
     while float((high - low).prod()) / pitch_mm**2 > _MOST_SAMPLES:
         pitch_mm *= 2
     columns, rows = (-(-(high - low) // pitch_mm) + 1).tolist()
-    samples: IntArray = _far_samples(np.ascontiguousarray(xy_mm), low, (rows, columns), pitch_mm, gap_m)
+    beside = math.ceil(reach_mm / pitch_mm) if math.isfinite(reach_mm) else -1
+    samples: IntArray = _far_samples(np.ascontiguousarray(xy_mm), low, (rows, columns), pitch_mm, gap_m, beside)
     return samples
 
 

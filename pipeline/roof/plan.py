@@ -13,7 +13,7 @@ from shapely import MultiPolygon, Polygon
 
 from pipeline.compiler import kernel
 from pipeline.errors import BuildingError
-from pipeline.geometry import bounds_of, spacing_over_area_m
+from pipeline.geometry import bounds_of, nearest_distance, spacing_over_area_m
 from pipeline.model import (
     BoolArray,
     Candidate,
@@ -69,6 +69,8 @@ class RoofPoints:
     """(n,) bool, True where the pulse went on to a lower return."""
     spacing_m: float
     """Typical distance of neighbours in plan."""
+    nearest_m: float
+    """Median distance from the nearest one."""
     footprint_mm: MultiPolygon | None
     """The given footprint in integer millimetres."""
     outline_mm: MultiPolygon | None = None
@@ -92,6 +94,7 @@ class RoofPoints:
             labels=np.zeros(0, np.int32),
             split=np.zeros(0, np.bool_),
             spacing_m=math.nan,
+            nearest_m=math.nan,
             footprint_mm=_in_mm(footprint),
         )
 
@@ -128,6 +131,7 @@ def roof_points(cloud: PreparedCloud, settings: RoofSettings, decisions: list[De
         labels=np.full(len(index), -1, np.int32),
         split=_are_among(xy_mm, candidate.split_returns),
         spacing_m=min(max(spacing_over_area_m(points), _MIN_SPACING_M), _MAX_SPACING_M),
+        nearest_m=nearest_distance(points),
         footprint_mm=_in_mm(candidate.footprint),
         limit_mm=limit_mm,
         outline_mm=_in_mm(candidate.outline),
@@ -207,7 +211,7 @@ def _traced_plan(roof: RoofPoints, planes: Sequence[Plane], settings: RoofSettin
     _require_extent(float((high - low).max()) * 1e-3)
     pitch = max(_MIN_PITCH_MM, round(_PITCH_SPACINGS * roof.spacing_m * 1e3))
     gap_m = settings.gap_spacings * roof.spacing_m
-    samples = empty_samples(roof.xy_mm, low, high, pitch, gap_m)
+    samples = empty_samples(roof.xy_mm, low, high, pitch, gap_m, margin if given is None else math.inf)
     frame = _frame(low, high, margin)
     xy_mm = np.concatenate((roof.xy_mm, samples, frame))
     tin = triangulate(xy_mm)
@@ -255,7 +259,7 @@ def _traced_plan(roof: RoofPoints, planes: Sequence[Plane], settings: RoofSettin
         faces = march(xy_mm, tin, labels, coefficients, settings.outside_fraction, step_offset_m)
     drawn = roof.outline_mm
     if drawn is None:
-        edge_points = EdgePoints.of(roof.xy_mm, roof.split, roof.spacing_m)
+        edge_points = EdgePoints.of(roof.xy_mm, roof.split, roof.spacing_m, roof.nearest_m)
         drawn = straighten(around, roof.spacing_m, settings, edge_points)
         if roof.facades is not None and settings.at_walls:
             reach_m = 1e-3 * mixed_pulse_reach_mm(around, edge_points)
@@ -288,7 +292,7 @@ def walls_of(footprint: Polygon | MultiPolygon, roof: RoofPoints, settings: Roof
     from pipeline.roof.footprint_in_mm import footprint_in_mm
 
     eaves_mm = footprint_in_mm(footprint)
-    reach_mm = mixed_pulse_reach_mm(eaves_mm, EdgePoints.of(roof.xy_mm, roof.split, roof.spacing_m))
+    reach_mm = mixed_pulse_reach_mm(eaves_mm, EdgePoints.of(roof.xy_mm, roof.split, roof.spacing_m, roof.nearest_m))
     walls: Walls | None = extra("walls_beneath")(
         eaves_mm, roof.facades, 1e-3 * reach_mm, settings.usual_overhang_m, settings.min_overhang_m
     )

@@ -210,7 +210,9 @@ def _grown_surface(
     """
 
     def lying(around: set[int], reach_mm: float) -> set[int]:
-        away = _distances_from_quadric(xyz, np.isin(of_vertex, sorted(members)), _NEAR_MM)
+        is_member = np.zeros(len(held), np.bool_)
+        is_member[sorted(members)] = True
+        away = _distances_from_quadric(xyz, is_member[of_vertex], _NEAR_MM)
         near = np.bincount(of_vertex, away <= reach_mm, minlength=len(held))
         return {k for k in around if near[k] >= _JOINING * held[k]}
 

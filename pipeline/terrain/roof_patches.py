@@ -173,15 +173,18 @@ def local_planes(x: IntArray, y: IntArray, z: IntArray) -> FloatArray:
     return out
 
 
-def circumradii(x: IntArray, y: IntArray, facets: LabelArray) -> FloatArray:
-    """Circumradius of every facet, (m,), in the unit of the vertices."""
-    a, b, c = facets.T
-    ux, uy = (x[b] - x[a]).astype(np.float64), (y[b] - y[a]).astype(np.float64)
-    vx, vy = (x[c] - x[a]).astype(np.float64), (y[c] - y[a]).astype(np.float64)
-    wx, wy = vx - ux, vy - uy
-    product = np.sqrt(ux * ux + uy * uy) * np.sqrt(vx * vx + vy * vy) * np.sqrt(wx * wx + wy * wy)
-    radii: FloatArray = product / (2.0 * (ux * vy - uy * vx))
-    return radii
+@kernel
+def facet_sizes(x: IntArray, y: IntArray, facets: LabelArray) -> tuple[FloatArray, FloatArray]:
+    """Circumradius of every facet, (m,), and the lengths of its edges, (m, 3), in the unit of the vertices."""
+    radii, lengths = np.empty(len(facets)), np.empty((len(facets), 3))
+    for t in range(len(facets)):
+        a, b, c = facets[t]
+        ux, uy, vx, vy = float(x[b] - x[a]), float(y[b] - y[a]), float(x[c] - x[a]), float(y[c] - y[a])
+        wx, wy = vx - ux, vy - uy
+        lengths[t, 0], lengths[t, 1] = math.sqrt(ux * ux + uy * uy), math.sqrt(vx * vx + vy * vy)
+        lengths[t, 2] = math.sqrt(wx * wx + wy * wy)
+        radii[t] = lengths[t, 0] * lengths[t, 1] * lengths[t, 2] / (2.0 * (ux * vy - uy * vx))
+    return radii, lengths
 
 
 @kernel
@@ -411,6 +414,8 @@ class GrownPatches:
     """Their Delaunay TIN."""
     is_sound: BoolArray
     """(m,) whether a facet bridges no gap."""
+    half_edge_mm: float
+    """Half the median edge of the facets that bridge none."""
     label: LabelArray
     """(n,) int32, patch of every vertex."""
     planes: FloatArray
@@ -422,10 +427,11 @@ def grown_patches(x: IntArray, y: IntArray, z: IntArray, tin: Tin) -> GrownPatch
 
     Vertices (n,) are in millimetres from a place near by, sorted by (x, y), under their Delaunay TIN.
     """
-    radii = circumradii(x, y, tin.facets)
+    radii, lengths = facet_sizes(x, y, tin.facets)
     limit = _TYPICAL_RADII * float(np.median(radii))
     is_sound = radii <= 1000.0 * min(max(limit / 1000.0, _MAX_RADIUS_M / 2.0), _MAX_RADIUS_M)
     sound = np.flatnonzero(is_sound).astype(np.int32)
+    half_mm = 0.5 * float(np.median(lengths[sound])) if len(sound) else 0.0
     vertices = RoofVertices(x, y, z, *vertex_neighbours(len(x), tin.facets, sound))
     local = local_planes(x, y, z)
     label, planes = grow_patches(vertices, local, np.argsort(local[:, 2], kind="stable"))
@@ -434,7 +440,9 @@ def grown_patches(x: IntArray, y: IntArray, z: IntArray, tin: Tin) -> GrownPatch
     planes = np.concatenate((planes, np.full((count - len(planes), 3), np.nan)))
     kept = np.bincount(label, minlength=count) > 0  # some patches lost all their vertices
     label = (np.cumsum(kept, dtype=np.int32) - 1)[label]
-    return GrownPatches(vertices=vertices, tin=tin, is_sound=is_sound, label=label, planes=planes[kept])
+    return GrownPatches(
+        vertices=vertices, tin=tin, is_sound=is_sound, half_edge_mm=half_mm, label=label, planes=planes[kept]
+    )
 
 
 def measured_patches(grown: GrownPatches, min_step_m: float) -> tuple[Patches, Borders]:
@@ -446,13 +454,8 @@ def measured_patches(grown: GrownPatches, min_step_m: float) -> tuple[Patches, B
     sums = [np.bincount(label, values / 1000.0, minlength=count) for values in (x, y, z)]
     centres = np.column_stack(sums) / np.maximum(np.bincount(label, minlength=count), 1)[:, None]
     gaps, sights, _, _ = border_pieces(x, y, facets, neighbours, across, label, count)
-    edges = facets[grown.is_sound]
-    half_edge_mm = (
-        0.5 * np.median(np.hypot(*(v[edges] - v[np.roll(edges, 1, axis=1)] for v in (x, y)))) if len(edges) else 0.0
-    )
-    borders = _borders(
-        pairs, ends, planes, (1000.0 * min_step_m, float(half_edge_mm)), _longest_first(gaps, sights, count)
-    )
+    within_mm = 1000.0 * min_step_m, grown.half_edge_mm
+    borders = _borders(pairs, ends, planes, within_mm, _longest_first(gaps, sights, count))
     outlines = outline / 1000.0
     np.add.at(outlines, borders.first, borders.length_m)
     np.add.at(outlines, borders.second, borders.length_m)

@@ -99,23 +99,27 @@ def _turns(directions: FloatArray, prices: Prices) -> FloatArray:
 
 
 @kernel(inline="always")
-def _end_price(angle: float, is_first: bool, is_last: bool, met: FloatArray, prices: Prices) -> float:
-    """The price of the ends of an edge on the lines that the description begins and ends on, which have two sides."""
-    price = 0.0
-    for k in range(2):
-        if is_first if k == 0 else is_last:
-            turn = angle - met[k]
-            price += _turn_price(-abs(math.cos(turn)), math.sin(turn), prices)  # no price if it is nan
-    return price
+def _end_price(way: tuple[float, float], line: float, prices: Prices) -> float:
+    """The price of an end of an edge, a unit vector, on a line with a direction, which has two sides; 0 for nan."""
+    ux, uy = math.cos(line), math.sin(line)
+    return _turn_price(-abs(ux * way[0] + uy * way[1]), ux * way[1] - uy * way[0], prices)
 
 
 @kernel(inline="always")
-def _own_direction(moments: tuple[float, float, float], cx: float, cy: float) -> tuple[float, float]:
-    """The angle of the line through a stretch with moments xx, xy and yy, and how far its chord goes along it."""
-    sxx, sxy, syy = moments
-    angle = 0.5 * math.atan2(2.0 * sxy, sxx - syy)
-    along = math.cos(angle) * cx + math.sin(angle) * cy
-    return angle if along >= 0.0 else angle + math.pi, along
+def _own_direction(sxx: float, sxy: float, syy: float, root: float) -> tuple[float, float]:
+    """The unit vector along a stretch with some moments, `root` the difference of its principal ones."""
+    half = 0.5 * (sxx - syy) / root if root > 0.0 else 0.5
+    return math.sqrt(max(0.5 + half, 0.0)), math.copysign(math.sqrt(max(0.5 - half, 0.0)), sxy)
+
+
+@kernel(inline="always")
+def _kept(live: IntArray, costs: FloatArray, most: float) -> int:
+    """Leave out the starts that cost more than the most; the number of those that stay, and one that may follow."""
+    kept = 0
+    for p in range(len(costs)):
+        live[kept] = live[p]
+        kept += costs[p] <= most
+    return kept + 1
 
 
 @kernel(inline="always")
@@ -160,86 +164,96 @@ def least_description(
     xy = border[breaks % len(border)]
     sums = _moments(border, breaks)
     turns = _turns(directions, prices)
-    cosines, sines = np.cos(directions), np.sin(directions)
+    # along each direction the places, across it the first and second moments
+    ux, uy = np.cos(directions).reshape(-1, 1), np.sin(directions).reshape(-1, 1)
+    along, across = ux * xy[:, 0] + uy * xy[:, 1], ux * sums[:, 2] - uy * sums[:, 1]
+    squares = ux * ux * sums[:, 5] - 2.0 * ux * uy * sums[:, 4] + uy * uy * sums[:, 3]
     # the best description up to each break that ends in a state; the best before an edge that begins in a state
     best = np.full((m, free + 1), np.inf)
     start = np.full((m, free + 1), -1, np.int64)
     came = np.full((m, free + 1), -1, np.int64)
-    angles = np.zeros((m, free + 1))
+    ways = np.zeros((m, free + 1, 2))
     before = np.full((m, free + 1), np.inf)
     through = np.full((m, free + 1), -1, np.int64)
     before[0, :] = 0.0
-    live = np.empty(m, np.int64)
-    live[0] = 0
-    alive = 1
-    spare = prices.edge + prices.free + prices.change + max(prices.sharp, prices.flat)
+    # the starts of edges that may still win, by direction and without one, and what they cost up to here
+    live, alive = np.zeros((d + 1, m), np.int64), np.ones(d + 1, np.int64)
+    costs = np.empty((d + 1, m))
+    spare = prices.change + max(prices.sharp, prices.flat)
     for j in range(1, m):
-        reached = np.full(alive, np.inf)
-        # the start that won last goes first: few of the others then need their angles
-        lead = np.searchsorted(live[:alive], max(start[j - 1, free], 0))
-        for turn in range(alive):
-            place = lead if turn == 0 else turn - (turn <= lead)
-            i = live[place]
-            w = sums[j, 0] - sums[i, 0]
-            if w <= 0.0:
-                reached[place] = 0.0
-                continue
-            mx, my = (sums[j, 1] - sums[i, 1]) / w, (sums[j, 2] - sums[i, 2]) / w
-            sxx = (sums[j, 3] - sums[i, 3]) / w - mx * mx
-            sxy = (sums[j, 4] - sums[i, 4]) / w - mx * my
-            syy = (sums[j, 5] - sums[i, 5]) / w - my * my
-            cx, cy = xy[j, 0] - xy[i, 0], xy[j, 1] - xy[i, 1]
-            scale = w * per_mm
-            for k in range(d + 1):
-                state, angle, along = free, 0.0, 0.0
+        for k in range(d + 1):
+            # the start that won last goes first: few of the others then need more than their costs
+            state = 2 * k + (best[j - 1, min(2 * k + 1, free)] < best[j - 1, 2 * k])
+            lead = np.searchsorted(live[k, : alive[k]], max(start[j - 1, state], 0))
+            for turn in range(alive[k]):
+                p = lead if turn == 0 else turn - (turn <= lead)
+                i = live[k, p]
+                w = sums[j, 0] - sums[i, 0]
+                if w <= 0.0:
+                    costs[k, p] = 0.0
+                    continue
                 if k < d:
-                    off = sines[k] * sines[k] * sxx - 2.0 * sines[k] * cosines[k] * sxy + cosines[k] * cosines[k] * syy
-                    along = cosines[k] * cx + sines[k] * cy
-                    state = 2 * k if along >= 0.0 else 2 * k + 1
-                    angle = directions[k] if along >= 0.0 else directions[k] + math.pi
+                    way, mean = along[k, j] - along[k, i], across[k, j] - across[k, i]
+                    vx, vy = ux[k, 0], uy[k, 0]
+                    state = 2 * k if way >= 0.0 else 2 * k + 1
+                    off = squares[k, j] - squares[k, i] - mean * mean / w
+                    costs[k, p] = before[i, state] + per_mm * max(off, 0.0)
+                    total = costs[k, p] + prices.edge
+                    if total > best[j, state] or abs(way) < _LEAST_PROGRESS * w:
+                        continue
                 else:
-                    off = 0.5 * (sxx + syy) - math.sqrt(0.25 * (sxx - syy) ** 2 + sxy * sxy)
-                unexplained = before[i, state] + scale * max(off, 0.0)
-                reached[place] = min(reached[place], unexplained)
-                total = unexplained + (prices.edge if k < d else prices.edge + prices.free)
-                if total > best[j, state]:
-                    continue
-                if k == d:
-                    angle, along = _own_direction((sxx, sxy, syy), cx, cy)
-                if abs(along) < _LEAST_PROGRESS * w:
-                    continue
+                    mx, my, a_w = sums[j, 1] - sums[i, 1], sums[j, 2] - sums[i, 2], 1.0 / w
+                    sxx = sums[j, 3] - sums[i, 3] - mx * mx * a_w
+                    sxy = sums[j, 4] - sums[i, 4] - mx * my * a_w
+                    syy = sums[j, 5] - sums[i, 5] - my * my * a_w
+                    root = math.sqrt((sxx - syy) * (sxx - syy) + 4.0 * sxy * sxy)
+                    costs[k, p] = before[i, free] + per_mm * max(0.5 * (sxx + syy - root), 0.0)
+                    state = free
+                    total = costs[k, p] + (prices.edge + prices.free)
+                    if total > best[j, free]:
+                        continue
+                    vx, vy = _own_direction(sxx, sxy, syy, root)
+                    way = vx * (xy[j, 0] - xy[i, 0]) + vy * (xy[j, 1] - xy[i, 1])
+                    if abs(way) < _LEAST_PROGRESS * w:
+                        continue
+                if way < 0.0:
+                    vx, vy = -vx, -vy
                 last = through[i, state]
-                total += _end_price(angle, i == 0, j == m - 1, met, prices)
-                if i > 0 and free in (state, last):
-                    bend = angle - angles[i, last]
-                    total += _turn_price(math.cos(bend), math.sin(bend), prices)
+                if i == 0:
+                    total += _end_price((vx, vy), met[0], prices)
+                elif free in (state, last):
+                    bx, by = ways[i, last, 0], ways[i, last, 1]
+                    total += _turn_price(bx * vx + by * vy, bx * vy - by * vx, prices)
+                if j == m - 1:
+                    total += _end_price((vx, vy), met[1], prices)
                 if total > best[j, state] or (total == best[j, state] and i > start[j, state]):
                     continue
-                best[j, state], start[j, state], came[j, state], angles[j, state] = total, i, last, angle
-        least = np.min(best[j])
+                best[j, state], start[j, state], came[j, state] = total, i, last
+                ways[j, state, 0], ways[j, state, 1] = vx, vy
         _turn(best[j], turns, before[j], through[j])
-        kept = 0
-        for place in range(alive):
-            if reached[place] <= least + spare:
-                live[kept] = live[place]
-                kept += 1
-        live[kept] = j
-        alive = kept + 1
+        for k in range(d + 1):
+            most = max(before[j, 2 * k], before[j, min(2 * k + 1, free)]) + spare
+            alive[k] = _kept(live[k], costs[k, : alive[k]], most)
+            live[k, alive[k] - 1] = j
     state = int(np.argmin(best[m - 1]))
-    ends, of_edge, along_edge = _traced_back(start, came, angles, state)
+    ends, of_edge, along_edge = _traced_back(start, came, ways, directions, state)
     return ends, of_edge, along_edge, best[m - 1, state]
 
 
 @kernel(inline="always")
 def _traced_back(
-    start: IntArray, came: IntArray, angles: FloatArray, state: int
+    start: IntArray, came: IntArray, ways: FloatArray, directions: FloatArray, state: int
 ) -> tuple[IntArray, IntArray, FloatArray]:
     """The ends of the edges of the best description, the direction of each and its angle, from the last one back."""
     m, free = len(start), start.shape[1] - 1
     ends, of_edge, along_edge = np.empty(m, np.int64), np.empty(m, np.int64), np.empty(m)
     count, j = 0, m - 1
     while j > 0 and state >= 0:
-        ends[count], of_edge[count], along_edge[count] = j, FREE if state == free else state // 2, angles[j, state]
+        ends[count], of_edge[count] = j, FREE if state == free else state // 2
+        if state == free:
+            along_edge[count] = math.atan2(ways[j, state, 1], ways[j, state, 0])
+        else:
+            along_edge[count] = directions[state // 2] + (math.pi if state % 2 else 0.0)
         j, state = start[j, state], came[j, state]
         count += 1
     ends[count] = 0

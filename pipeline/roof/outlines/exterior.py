@@ -130,10 +130,10 @@ def _straight_rings(
     drawn: list[FloatArray | None] = [None] * len(borders)
     least_mm = min(max(_NOISE_OF_SIZE * math.sqrt(polygon.area), 100.0), noise_m[1] * 1e3)
     noise_mm = max(noise_m[0] * 1e3, least_mm)
-    if points is not None and len(points.xy_mm) <= _FEW_POINTS and spacing_m >= _FEW_SPACING_M:
-        drawn[0] = _of_few_points(borders[0], spacing_m, points, noise_mm)
-    rings = [_with_breaks(border, _BREAK_SPACINGS * spacing_m * 1e3) for border in borders]
+    rings = [_Ring(border, breaks_of(border, _BREAK_SPACINGS * spacing_m * 1e3)) for border in borders]
     least = max(_LEAST_SPACINGS * spacing_m, _LEAST_M) * 1e3
+    if points is not None and len(points.xy_mm) <= _FEW_POINTS and spacing_m >= _FEW_SPACING_M:
+        drawn[0] = _of_few_points(rings[0], points, noise_mm, least)
     for factor in _FACTORS:
         if all(ring is not None for ring in drawn):
             break
@@ -157,32 +157,18 @@ def _evenness(outline_mm: MultiPolygon, points: EdgePoints | None) -> float:
     return math.pow(min(max(points.nearest_mm / (_NEAREST * spacing_mm), 1.0), _EVENEST), _EVEN_POWER)
 
 
-def _of_few_points(border: FloatArray, spacing_m: float, points: EdgePoints, noise_mm: float) -> FloatArray | None:
+def _of_few_points(ring: _Ring, points: EdgePoints, noise_mm: float, least_mm: float) -> FloatArray | None:
     """The likeliest ring around few points: as described, or in two directions of any."""
-    from pipeline.roof.outlines.few_points import directions, envelope_mm, likeliest, sharp_corners
+    from pipeline.roof.outlines.few_points import directions, likeliest
 
-    raw = Polygon(border)
-    area_mm2, most_mm2 = raw.area, 4.0 * _MOVED * noise_mm * raw.length
-    xy_mm = points.xy_mm.astype(np.float64)
-    xy_mm = xy_mm[shapely.contains_xy(shapely.buffer(raw, 1e3 * spacing_m), xy_mm)]
-    ring = _with_breaks(border, _BREAK_SPACINGS * spacing_m * 1e3)
-    per_mm = 0.5 / (1e3 * spacing_m * noise_mm * noise_mm)
-    square = PRICES._replace(free=PRICES.sharp)
-    ways = described([ring], 1e3 * spacing_m, noise_mm)
-    ways += [(border, _runs(ring, pairs_of([angle]), per_mm, square)[0]) for angle in directions().tolist()]
-    drawings: list[tuple[float, FloatArray]] = []
-    least = max(_LEAST_SPACINGS * spacing_m, _LEAST_M) * 1e3
-    for along, runs in ways:
-        for run in runs:
-            shift = envelope_mm(run, xy_mm, area_mm2, 1.5e3 * spacing_m)
-            run.x += shift * math.sin(run.direction)
-            run.y -= shift * math.cos(run.direction)
-        found = _ring_of(along, runs, least, most_mm2) if len(runs) >= _FEWEST else None
-        if found is not None:
-            free = sum(not run.exact for run in runs)
-            cost = PRICES.edge * len(found) + PRICES.free * free + PRICES.sharp * sharp_corners(found)
-            drawings.append((cost, found))
-    return likeliest(drawings, xy_mm, spacing_m)
+    raw, per_mm = Polygon(ring.border), 0.5 / (points.spacing_mm * noise_mm * noise_mm)
+    ways, square = described([ring], points.spacing_mm, noise_mm), PRICES._replace(free=PRICES.sharp)
+    ways += [(ring.border, _runs(ring, pairs_of([angle]), per_mm, square)[0]) for angle in directions().tolist()]
+
+    def drawn(border: FloatArray, runs: Sequence[Run]) -> FloatArray | None:
+        return _ring_of(border, runs, least_mm, 4.0 * _MOVED * noise_mm * raw.length) if len(runs) >= _FEWEST else None
+
+    return likeliest(ways, drawn, raw, points, PRICES)
 
 
 def described(rings: Sequence[_Ring], spacing_mm: float, noise_mm: float) -> list[tuple[FloatArray, list[Run]]]:
@@ -299,11 +285,6 @@ def _more_exact(systems: Sequence[float], runs: Sequence[Run]) -> list[float]:
         system + (math.fsum(off * w for off, w in of) / math.fsum(w for _, w in of) if of else 0.0)
         for system, of in zip(systems, offs, strict=True)
     ]
-
-
-def _with_breaks(border: FloatArray, step_mm: float) -> _Ring:
-    """A ring with breaks at vertices that lie a step or more apart."""
-    return _Ring(border=border, breaks=breaks_of(border, step_mm))
 
 
 @kernel

@@ -8,15 +8,17 @@ distance is worth, and edges what they cost in a description.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 import shapely
+from shapely import Polygon
 
 from pipeline.compiler import kernel
 from pipeline.model import FloatArray
+from pipeline.roof.edge_position import EdgePoints
 from pipeline.roof.lines import Run
-from pipeline.roof.outlines.description import SHARP
+from pipeline.roof.outlines.description import SHARP, Prices
 
 _OFF_MM = 120.0
 """Standard deviation of a point about the edge that it lies outside of."""
@@ -84,17 +86,33 @@ def sharp_corners(ring: FloatArray) -> int:
     return int(np.count_nonzero(cosine < SHARP * lengths * np.roll(lengths, -1)))
 
 
-def likeliest(drawings: Iterable[tuple[float, FloatArray]], xy_mm: FloatArray, spacing_m: float) -> FloatArray | None:
-    """The ring of least cost among some with the cost of their edges; points (n, 2); None where there are none."""
-    best, least = None, math.inf
+def likeliest(
+    ways: Iterable[tuple[FloatArray, list[Run]]],
+    drawn: Callable[[FloatArray, list[Run]], FloatArray | None],
+    raw: Polygon,
+    points: EdgePoints,
+    prices: Prices,
+) -> FloatArray | None:
+    """The ring of least cost among those that are drawn with some edges of a border, after the points moved them.
+
+    `raw` is the ring before; None where none can be drawn.
+    """
+    best, least, spacing_mm = None, math.inf, points.spacing_mm
+    xy_mm = points.xy_mm.astype(np.float64)
+    xy_mm = xy_mm[shapely.contains_xy(shapely.buffer(raw, spacing_mm), xy_mm)]
     places = shapely.points(xy_mm)
-    for cost, ring in drawings:
-        polygon = shapely.polygons(ring)
-        area = float(shapely.area(polygon))
-        if area <= 0.0 or not shapely.is_valid(polygon):
+    for border, runs in ways:
+        for run in runs:
+            shift = envelope_mm(run, xy_mm, raw.area, 1.5 * spacing_mm)
+            run.x += shift * math.sin(run.direction)
+            run.y -= shift * math.cos(run.direction)
+        ring = drawn(border, runs)
+        polygon = None if ring is None else shapely.polygons(ring)
+        if ring is None or polygon is None or polygon.area <= 0.0 or not polygon.is_valid:
             continue
+        total = prices.edge * len(ring) + prices.free * sum(not run.exact for run in runs)
         off = shapely.distance(places, polygon)
-        total = cost + len(xy_mm) * math.log(area / (1e3 * spacing_m) ** 2)
+        total += prices.sharp * sharp_corners(ring) + len(xy_mm) * math.log(polygon.area / spacing_mm**2)
         total += float(np.minimum(0.5 * (off / _OFF_MM) ** 2, _MOST).sum())
         if total < least:
             best, least = ring, total

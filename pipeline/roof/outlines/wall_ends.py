@@ -9,13 +9,15 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import shapely
 from shapely import MultiPolygon
 
-from pipeline.model import FloatArray
-from pipeline.roof.lines import Run, corners, crossing
+from pipeline.compiler import kernel
+from pipeline.model import FloatArray, IntArray
+from pipeline.roof.lines import Run, corners, crossing, off_piece
 from pipeline.roof.outlines.description import SHARP, Prices
 
 PRICES = Prices(edge=6.0, free=14.0, change=4.0, sharp=60.0, flat=60.0)
@@ -29,8 +31,17 @@ _FAR_SPACINGS, _FAR_M = 8.0, 6.0
 _OVERSHOOT_MM = 5.0
 """Walls end this far beyond what they meet: the lines must cross."""
 
-Met = tuple[float, FloatArray] | None
-"""What the end of a wall meets: how far from the vertex before that end, millimetres, and where it begins and ends."""
+Met = tuple[float, int] | None
+"""What the end of a wall meets: how far from the vertex before that end, millimetres, and the number of the piece."""
+
+
+class Obstacles(NamedTuple):
+    """What walls can end on."""
+
+    pieces: FloatArray
+    """(m, 4) the edges of the outline, then those of all walls: both ends of each, millimetres."""
+    wall: IntArray
+    """(m,) the wall of each; -1 for the outline."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,42 +88,71 @@ class Wall:
         return np.array([ends[0], *between, ends[1]])
 
 
-def obstacles_of(edges: FloatArray, lines: Sequence[FloatArray], number: int) -> FloatArray:
-    """What a wall can end on: the edges of the outline and of all other walls, both ends of each, (m, 4)."""
-    others = [np.column_stack((line[:-1], line[1:])) for k, line in enumerate(lines) if k != number]
-    return np.concatenate((edges, *others))
+def obstacles_of(edges: FloatArray, lines: Sequence[FloatArray]) -> Obstacles:
+    """What walls with some lines (n, 2) can end on: the edges of the outline (e, 4), and the other walls."""
+    pieces = [edges, *(np.column_stack((line[:-1], line[1:])) for line in lines)]
+    return Obstacles(np.concatenate(pieces), np.repeat(np.arange(-1, len(lines)), [len(piece) for piece in pieces]))
 
 
-def directions_beside(places: FloatArray, obstacles: FloatArray) -> FloatArray:
-    """The directions of the obstacles (m, 4) nearest to some places (n, 2), radians."""
-    pieces = shapely.linestrings(obstacles.reshape(-1, 2, 2))
-    nearest = obstacles[[int(np.argmin(shapely.distance(point, pieces))) for point in shapely.points(places)]]
-    return np.arctan2(nearest[:, 3] - nearest[:, 1], nearest[:, 2] - nearest[:, 0])
+@kernel
+def directions_beside(places: FloatArray, obstacles: Obstacles, number: int) -> FloatArray:
+    """The directions of the obstacles nearest to some places (n, 2), radians, which are not the wall of a number."""
+    pieces, wall = obstacles
+    found = np.full(len(places), np.nan)
+    for k in range(len(places)):
+        least = np.inf
+        for p in range(len(pieces)):
+            if wall[p] != number:
+                off = off_piece(pieces[p, :2], pieces[p, 2:], places[k])
+                if off < least:
+                    least, found[k] = off, math.atan2(pieces[p, 3] - pieces[p, 1], pieces[p, 2] - pieces[p, 0])
+    return found
 
 
-def met(line: FloatArray, obstacles: FloatArray, scale: Scale) -> tuple[Met, Met]:
-    """What the first end of a wall meets nearest to the end of its border, and what the last one; None for nothing."""
-    found: list[Met] = []
-    for end, before in ((0, 1), (-1, -2)):
-        way = line[end] - line[before]
-        length = float(np.hypot(*way))
-        if length == 0.0:
-            found.append(None)
+def met(line: FloatArray, number: int, obstacles: Obstacles, scale: Scale) -> tuple[Met, Met]:
+    """What the first end of the wall of a number meets nearest to the end of its border, and what the last one."""
+    first, last = (
+        (way, piece) if piece >= 0 else None
+        for way, piece in _met(line, number, obstacles, scale.beyond_mm, scale.far_mm)
+    )
+    return first, last
+
+
+@kernel
+def _met(
+    line: FloatArray, number: int, obstacles: Obstacles, beyond: float, far: float
+) -> tuple[tuple[float, int], tuple[float, int]]:
+    """The kernel of `met`; piece -1 for nothing."""
+    return (
+        _met_from(line[1], line[0], len(line) == 2, number, obstacles, beyond, far),
+        _met_from(line[-2], line[-1], len(line) == 2, number, obstacles, beyond, far),
+    )
+
+
+@kernel
+def _met_from(
+    start: FloatArray, end: FloatArray, is_alone: bool, number: int, obstacles: Obstacles, beyond: float, far: float
+) -> tuple[float, int]:
+    """The place on the ray from the vertex before an end at which it meets an obstacle, and which; -1 for none."""
+    pieces, wall = obstacles
+    length = math.hypot(end[0] - start[0], end[1] - start[1])
+    at, piece = np.nan, -1
+    if length == 0.0:
+        return at, piece
+    vx, vy = (end[0] - start[0]) / length, (end[1] - start[1]) / length
+    border_end = length - beyond
+    # the first edge of several may end where it begins, at a corner on the outline
+    nearest = max(0.1 * length if is_alone else -_OVERSHOOT_MM, border_end - 2.0 * beyond)
+    for p in range(len(pieces)):
+        ux, uy = pieces[p, 2] - pieces[p, 0], pieces[p, 3] - pieces[p, 1]
+        det = vx * uy - vy * ux
+        if wall[p] == number or not abs(det) > 1e-9:
             continue
-        way /= length
-        border_end = length - scale.beyond_mm
-        # the places on the ray from the vertex before at which it meets an obstacle
-        ux, uy = obstacles[:, 2] - obstacles[:, 0], obstacles[:, 3] - obstacles[:, 1]
-        det = way[0] * uy - way[1] * ux
-        dx, dy = obstacles[:, 0] - line[before, 0], obstacles[:, 1] - line[before, 1]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            t, u = (dx * uy - dy * ux) / det, (dx * way[1] - dy * way[0]) / det
-        meets = (np.abs(det) > 1e-9) & (u >= 0.0) & (u <= 1.0) & (t <= border_end + scale.far_mm)
-        # the first edge of several may end where it begins, at a corner on the outline
-        meets &= t > max(0.1 * length if len(line) == 2 else -_OVERSHOOT_MM, border_end - 2.0 * scale.beyond_mm)
-        nearest = int(np.argmin(np.where(meets, np.abs(t - border_end), np.inf)))
-        found.append((float(t[nearest]), obstacles[nearest]) if meets[nearest] else None)
-    return found[0], found[1]
+        dx, dy = pieces[p, 0] - start[0], pieces[p, 1] - start[1]
+        t, u = (dx * uy - dy * ux) / det, (dx * vy - dy * vx) / det
+        if 0.0 <= u <= 1.0 and nearest < t <= border_end + far and not abs(t - border_end) >= abs(at - border_end):
+            at, piece = t, p
+    return at, piece
 
 
 def end_outside(runs: list[Run], outline_mm: MultiPolygon) -> None:
@@ -145,15 +185,12 @@ def put_through_corner(wall: Wall, ends: tuple[Met, Met], scale: Scale, edges: F
     moves: dict[int, tuple[float, Run]] = {}
     for end, sense in ((0, 1.0), (-1, -1.0)):
         run, one = wall.runs[end], ends[end]
-        if one is None or not (edges == one[1]).all(axis=1).any():
+        if one is None or one[1] >= len(edges):
             continue
         ux, uy = math.cos(run.direction), math.sin(run.direction)
-        for corner in one[1].reshape(2, 2):
-            off = ux * (corner[1] - run.y) - uy * (corner[0] - run.x)
-            starts, stops = ((edges[:, k : k + 2] == corner).all(axis=1) for k in (0, 2))
-            away = np.concatenate((edges[starts, 2:] - corner, edges[stops, :2] - corner))
-            is_sharp = sense * (away @ (ux, uy)) > -SHARP * np.hypot(away[:, 0], away[:, 1])
-            if is_sharp.any() or per_mm * run.length * off * off >= PRICES.edge:
+        for x, y in edges[one[1]].reshape(2, 2).tolist():
+            off = ux * (y - run.y) - uy * (x - run.x)
+            if per_mm * run.length * off * off >= PRICES.edge or _is_sharp(x, y, sense * ux, sense * uy, edges):
                 continue
             if id(run) not in moves or abs(off) < abs(moves[id(run)][0]):
                 moves[id(run)] = off, run
@@ -162,10 +199,22 @@ def put_through_corner(wall: Wall, ends: tuple[Met, Met], scale: Scale, edges: F
         run.y += off * math.cos(run.direction)
 
 
-def ended(line: FloatArray, obstacles: FloatArray, scale: Scale) -> FloatArray:
+@kernel
+def _is_sharp(x: float, y: float, ux: float, uy: float, edges: FloatArray) -> bool:
+    """Whether a wall that goes from a corner in a direction has a sharp angle with an edge (e, 4) that is there."""
+    for e in range(len(edges)):
+        for k in range(2):
+            if edges[e, 2 * k] == x and edges[e, 2 * k + 1] == y:
+                away_x, away_y = edges[e, 2 - 2 * k] - x, edges[e, 3 - 2 * k] - y
+                if away_x * ux + away_y * uy > -SHARP * math.hypot(away_x, away_y):
+                    return True
+    return False
+
+
+def ended(line: FloatArray, number: int, obstacles: Obstacles, scale: Scale) -> FloatArray:
     """A wall whose ends lie on what they meet."""
     result = line.copy()
-    for one, end, before in zip(met(line, obstacles, scale), (0, -1), (1, -2), strict=True):
+    for one, end, before in zip(met(line, number, obstacles, scale), (0, -1), (1, -2), strict=True):
         if one is not None:
             way = line[end] - line[before]
             result[end] = line[before] + (one[0] + _OVERSHOOT_MM) / float(np.hypot(*way)) * way

@@ -17,9 +17,11 @@ import math
 from collections.abc import Iterable, Sequence
 
 import numpy as np
+import numpy.typing as npt
 import shapely
 from shapely import LineString, MultiPolygon, Polygon
 
+from pipeline.compiler import kernel
 from pipeline.errors import BuildingError
 from pipeline.model import FloatArray, IntArray, LabelArray
 from pipeline.roof.footprint import polygons_of
@@ -72,44 +74,51 @@ def divided(
     points, `unit` (n,) their units.
     """
     edges = _edges_of(outline_mm)
-    chords = _chords(units, outline_mm, edges, spacing_m)
+    within = shapely.buffer(outline_mm, Scale.of(spacing_m).beyond_mm)
+    chords = _chords(_borders(units, within), outline_mm, edges, spacing_m)
     cells, owners, lost = _cells(outline_mm, chords, xy_mm, unit)
     lost |= set(units.labels.tolist()) - set(owners)
     if lost:
         # a unit that walls do not separate is drawn around its own points
         directions = pairs_of(peaks_of(_edge_runs(edges), 3))
         around = [
-            _drawn_around(polygon.exterior, directions, spacing_m)
+            _drawn_around(part.exterior, directions, spacing_m)
             for polygon, label in zip(units.polygons, units.labels.tolist(), strict=True)
             if label in lost
+            for part in polygons_of(shapely.intersection(polygon, within))
         ]
         cells, owners, _ = _cells(outline_mm, [*chords, *around], xy_mm, unit)
     return _united(cells, owners)
 
 
-def _chords(units: RoofPartition, outline_mm: MultiPolygon, edges: FloatArray, spacing_m: float) -> list[FloatArray]:
-    """The walls between units, (n, 2) each; their ends lie on the outline, edges (e, 4), or on other walls."""
+def _chords(
+    borders: Sequence[FloatArray], outline_mm: MultiPolygon, edges: FloatArray, spacing_m: float
+) -> list[FloatArray]:
+    """The walls along borders between units, (n, 2) each; they end on the outline, edges (e, 4), or on other walls."""
     scale = Scale.of(spacing_m)
     most = max(_IN_LINE_MM, scale.spacing_mm)
     walls = []
-    for border in _through(_borders(units, shapely.buffer(outline_mm, scale.beyond_mm))):
-        near = edges[shapely.distance(LineString(border), shapely.linestrings(edges.reshape(-1, 2, 2))) <= _NEARBY_MM]
+    pieces = shapely.linestrings(edges.reshape(-1, 2, 2))
+    for border in _through(borders):
+        near = edges[shapely.distance(LineString(border), pieces) <= _NEARBY_MM]
         directions = pairs_of(peaks_of(_edge_runs(near)))
         walls.append(Wall(border, directions, _described(border, directions, scale)))
     _put_in_line(walls, edges, most)
-    lines = [wall.line(scale) for wall in walls]
+    obstacles = obstacles_of(edges, [wall.line(scale) for wall in walls])
     for k, wall in enumerate(walls):
         # what it ends on is known once all are drawn
-        ends = directions_beside(wall.border[[0, -1]], obstacles_of(edges, lines, k))
+        ends = directions_beside(wall.border[[0, -1]], obstacles, k)
         walls[k] = dataclasses.replace(wall, runs=_described(wall.border, wall.directions, scale, ends))
         end_outside(walls[k].runs, outline_mm)
     _put_in_line(walls, edges, most)
     for change in (without_stubs, functools.partial(put_through_corner, edges=edges)):
         lines = [wall.line(scale) for wall in walls]
+        obstacles = obstacles_of(edges, lines)
         for k, wall in enumerate(walls):
-            change(wall, met(lines[k], obstacles_of(edges, lines, k), scale), scale)
+            change(wall, met(lines[k], k, obstacles, scale), scale)
     lines = [wall.line(scale) for wall in walls]
-    return [ended(line, obstacles_of(edges, lines, k), scale) for k, line in enumerate(lines)]
+    obstacles = obstacles_of(edges, lines)
+    return [ended(line, k, obstacles, scale) for k, line in enumerate(lines)]
 
 
 def _described(border: FloatArray, directions: FloatArray, scale: Scale, ends: FloatArray = NONE_MET) -> list[Run]:
@@ -142,32 +151,28 @@ def _edge_runs(edges: FloatArray) -> list[Run]:
 
 
 def _borders(units: RoofPartition, within: Polygon | MultiPolygon) -> list[FloatArray]:
-    """The borders between two units, (n, 2) each, as far as they lie within an area."""
-    polygons = np.array(units.polygons, dtype=object)
-    whole = [shapely.coverage_union_all(polygons[units.labels == number]) for number in np.unique(units.labels)]
-    borders: list[FloatArray] = []
-    for stretches in _stretches(whole):
-        common = shapely.line_merge(shapely.intersection(shapely.multilinestrings(stretches), within))
-        borders += [
-            np.asarray(line.coords)
-            for line in shapely.get_parts(common)
-            if isinstance(line, LineString) and line.length > _SHORTEST_MM
-        ]
-    return borders
+    """The borders between two units, (n, 2) each, as far as they lie within an area; each begins in the west."""
+    borders: list[list[list[float]]] = []
+    for line in shapely.get_parts(shapely.line_merge(shapely.intersection(_common_lines(units), within))).tolist():
+        if isinstance(line, LineString) and line.length > _SHORTEST_MM:
+            places = shapely.get_coordinates(line).tolist()
+            if places[0] == places[-1]:
+                west = places.index(min(places))
+                places = [*places[west:-1], *places[: west + 1]]
+            borders.append(places if places[0] <= places[-1] else places[::-1])
+    return [np.array(border) for border in sorted(borders)]
 
 
-def _stretches(shapes: Sequence[Polygon | MultiPolygon]) -> list[list[LineString]]:
-    """The lines that each two shapes of a coverage share, pair by pair: as the first one has them on its rings.
+def _common_lines(units: RoofPartition) -> npt.NDArray[np.object_]:
+    """The lines that each two units of a partition share, pair by pair, as the first one has them on its rings.
 
-    Shapes of a coverage have the same edges where they meet, which makes an overlay needless. A closed line begins at
-    its westernmost vertex.
+    Faces of a partition have the same edges where they meet, which makes an overlay needless.
     """
-    parts, of_part = shapely.get_parts(np.array(shapes, dtype=object), return_index=True)
-    rings, of_ring = shapely.get_rings(parts, return_index=True)
+    rings, of_ring = shapely.get_rings(units.polygons, return_index=True)
     xy, ring = shapely.get_coordinates(rings, return_index=True)
     inside = ring[:-1] == ring[1:]
     start, end, ring = xy[:-1][inside], xy[1:][inside], ring[:-1][inside]
-    own = of_part[of_ring[ring]]
+    own = units.labels[of_ring[ring]]
     is_turned = (start[:, 0] > end[:, 0]) | ((start[:, 0] == end[:, 0]) & (start[:, 1] > end[:, 1]))
     edges = np.where(is_turned[:, None], np.column_stack((end, start)), np.column_stack((start, end)))
     order = np.lexsort((own, *edges.T))
@@ -175,16 +180,17 @@ def _stretches(shapes: Sequence[Polygon | MultiPolygon]) -> list[list[LineString
     edge, other = order[twin], own[order[twin + 1]]
     order = np.lexsort((edge, other, own[edge]))
     edge, other = edge[order], other[order]
-    goes_on = (np.diff(edge) == 1) & (np.diff(ring[edge]) == 0) & (np.diff(other) == 0)
-    found: dict[tuple[int, int], list[LineString]] = {}
-    for stretch in np.split(np.arange(len(edge)), np.flatnonzero(~goes_on) + 1):
-        if len(stretch):
-            line = np.concatenate((start[edge[stretch]], end[edge[stretch[-1:]]]))
-            if (line[0] == line[-1]).all():
-                first = int(np.lexsort(line[:-1, ::-1].T)[0])
-                line = np.concatenate((line[first:-1], line[: first + 1]))
-            found.setdefault((int(own[edge[stretch[0]]]), int(other[stretch[0]])), []).append(LineString(line))
-    return list(found.values())
+    if len(edge) == 0:
+        return np.empty(0, object)
+    new_pair = (np.diff(own[edge], prepend=-1) != 0) | (np.diff(other, prepend=-1) != 0)
+    new_line = new_pair | (np.diff(edge, prepend=-2) != 1) | (np.diff(ring[edge], prepend=-1) != 0)
+    # a line has the starts of all its edges, and the end of the last
+    firsts = np.flatnonzero(new_line)
+    stops = np.append(firsts[1:], len(edge))
+    places = np.insert(start[edge], stops, end[edge[stops - 1]], axis=0)
+    lines = shapely.linestrings(places, indices=np.repeat(np.arange(len(firsts)), stops - firsts + 1))
+    pairs: npt.NDArray[np.object_] = shapely.multilinestrings(lines, indices=np.cumsum(new_pair[firsts]) - 1)
+    return pairs
 
 
 def _through(borders: Sequence[FloatArray]) -> list[FloatArray]:
@@ -198,7 +204,7 @@ def _through(borders: Sequence[FloatArray]) -> list[FloatArray]:
     follows: dict[tuple[int, bool], tuple[int, bool]] = {}
     for meeting in ends.values():
         ways = {end: _way_from(borders[end[0]], end[1]) for end in meeting}
-        pairs = [(float(ways[a] @ ways[b]), a, b) for a, b in itertools.combinations(meeting, 2) if a[0] != b[0]]
+        pairs = [(math.cos(ways[a] - ways[b]), a, b) for a, b in itertools.combinations(meeting, 2) if a[0] != b[0]]
         straightest = min(pairs, default=None)
         if straightest is not None and straightest[0] < _STRAIGHT_ON:
             _, a, b = straightest
@@ -227,33 +233,59 @@ def _through(borders: Sequence[FloatArray]) -> list[FloatArray]:
     return united
 
 
-def _way_from(border: FloatArray, at_start: bool) -> FloatArray:
-    """The unit vector from an end of a border into it."""
-    line = LineString(border if at_start else border[::-1])
-    inner = np.asarray(line.interpolate(min(_WAY_MM, line.length)).coords[0])
-    way = inner - np.asarray(line.coords[0])
-    return np.asarray(way / max(math.hypot(*way.tolist()), 1e-9))
+def _way_from(border: FloatArray, at_start: bool) -> float:
+    """The direction from an end of a border into it, radians."""
+    start = end = tuple(border[0 if at_start else -1].tolist())
+    left, share = _WAY_MM, 0.0
+    for place in (border[1:] if at_start else border[-2::-1]).tolist():
+        before, end, piece = end, place, math.dist(end, place)
+        left -= piece
+        if left <= 0.0:
+            share = left / piece
+            break
+    else:
+        before = end
+    x, y = end[0] + share * (end[0] - before[0]), end[1] + share * (end[1] - before[1])
+    return math.atan2(y - start[1], x - start[0])
 
 
 def _put_in_line(walls: Sequence[Wall], edges: FloatArray, most_mm: float) -> None:
     """Move walls onto the line of a parallel edge, or longer wall, that they nearly continue; the longest first."""
-    middle = 0.5 * (edges[:, :2] + edges[:, 2:])
-    ways = edges[:, 2:] - edges[:, :2]
-    lengths = np.hypot(ways[:, 0], ways[:, 1])
-    long = lengths >= _SHORTEST_MM
-    known = np.column_stack((middle, ways / np.maximum(lengths, 1e-9)[:, None], lengths))[long]
-    for run in sorted((run for wall in walls for run in wall.runs), key=lambda run: (-run.length, run.x, run.y)):
-        ux, uy = math.cos(run.direction), math.sin(run.direction)
-        dx, dy = known[:, 0] - run.x, known[:, 1] - run.y
-        off, along = ux * dy - uy * dx, ux * dx + uy * dy
-        gap = np.abs(along) - 0.5 * (known[:, 4] + run.length)
-        fits = (np.abs(ux * known[:, 3] - uy * known[:, 2]) <= _PARALLEL) & (np.abs(off) <= most_mm)
-        fits &= gap <= _IN_LINE_GAP_MM
-        if fits.any():
-            nearest = float(off[fits][np.argmin(np.abs(off[fits]))])
-            run.x -= nearest * uy
-            run.y += nearest * ux
-        known = np.concatenate((known, [[run.x, run.y, ux, uy, run.length]]))
+    runs = sorted((run for wall in walls for run in wall.runs), key=lambda run: (-run.length, run.x, run.y))
+    lines = np.array([(run.x, run.y, math.cos(run.direction), math.sin(run.direction), run.length) for run in runs])
+    for run, (x, y) in zip(runs, _in_line(edges, lines.reshape(-1, 5), most_mm).tolist(), strict=True):
+        run.x, run.y = x, y
+
+
+@kernel
+def _in_line(edges: FloatArray, lines: FloatArray, most: float) -> FloatArray:
+    """Where the middles of some lines move, (n, 2): onto the nearest of the edges (e, 4) and lines before them.
+
+    Lines (n, 5) are their middle, unit vector and length.
+    """
+    known = np.empty((len(edges) + len(lines), 5))
+    count = 0
+    for e in range(len(edges)):
+        vx, vy = edges[e, 2] - edges[e, 0], edges[e, 3] - edges[e, 1]
+        length = math.hypot(vx, vy)
+        if length >= _SHORTEST_MM:
+            known[count, 0], known[count, 1] = 0.5 * (edges[e, 0] + edges[e, 2]), 0.5 * (edges[e, 1] + edges[e, 3])
+            known[count, 2], known[count, 3], known[count, 4] = vx / length, vy / length, length
+            count += 1
+    for r in range(len(lines)):
+        x, y, ux, uy, length = lines[r]
+        nearest = np.nan
+        for k in range(count):
+            dx, dy = known[k, 0] - x, known[k, 1] - y
+            off, gap = ux * dy - uy * dx, abs(ux * dx + uy * dy) - 0.5 * (known[k, 4] + length)
+            is_parallel = abs(ux * known[k, 3] - uy * known[k, 2]) <= _PARALLEL
+            if is_parallel and abs(off) <= most and gap <= _IN_LINE_GAP_MM and not abs(off) >= abs(nearest):
+                nearest = off
+        known[count] = lines[r]
+        if not np.isnan(nearest):
+            known[count, 0], known[count, 1] = x - nearest * uy, y + nearest * ux
+        count += 1
+    return known[count - len(lines) : count, :2].copy()
 
 
 def _cells(
@@ -296,7 +328,10 @@ def _join_neighbour(k: int, cells: Sequence[Polygon], owners: list[int], tree: s
 
 
 def _is_narrow(cell: Polygon) -> bool:
-    return bool(shapely.is_empty(shapely.buffer(cell, -0.5 * _LEAST_WIDTH_MM)))
+    # a border this far inside takes no more area from it: the rest need not be drawn
+    reach = 0.5 * _LEAST_WIDTH_MM
+    most_mm2 = reach * (cell.length + 0.5 * math.pi * reach * shapely.get_num_coordinates(cell))
+    return bool(cell.area <= most_mm2 and shapely.is_empty(shapely.buffer(cell, -reach)))
 
 
 def _counts(cell: Polygon, xy_mm: IntArray, unit: LabelArray, count: int) -> IntArray:
@@ -305,6 +340,7 @@ def _counts(cell: Polygon, xy_mm: IntArray, unit: LabelArray, count: int) -> Int
     low, high = np.searchsorted(xy_mm[:, 0], [left, right + 1.0])
     xy, of = xy_mm[low:high], unit[low:high]
     inside = (xy[:, 1] >= bottom) & (xy[:, 1] <= top) & (of >= 0)
+    shapely.prepare(cell)
     inside[inside] = shapely.contains_xy(cell, xy[inside].astype(np.float64))
     return np.bincount(of[inside], minlength=count)
 
