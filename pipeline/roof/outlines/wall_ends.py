@@ -54,6 +54,10 @@ class Scale:
         )  # fmt: skip
         return cls(*(1e3 * max(share * spacing_m, least_m) for share, least_m in shares))
 
+    def against(self, run: Run, off_mm: FloatArray) -> FloatArray:
+        """How much the points of an edge speak against moving it sideways, by this far each (n,), in nats."""
+        return run.length / (2.0 * self.spacing_mm * self.noise_mm**2) * off_mm * off_mm
+
 
 @dataclasses.dataclass(frozen=True)
 class Wall:
@@ -141,7 +145,6 @@ def put_through_corner(wall: Wall, ends: tuple[Met, Met], scale: Scale, edges: F
     An end moves if its points speak less against it than an edge costs, and if no angle at the corner is sharp. A
     wall of one edge moves to one corner, the nearer one.
     """
-    per_mm = 0.5 / (scale.spacing_mm * scale.noise_mm**2)
     moves: dict[int, tuple[float, Run]] = {}
     for end, sense in ((0, 1.0), (-1, -1.0)):
         run, one = wall.runs[end], ends[end]
@@ -153,7 +156,7 @@ def put_through_corner(wall: Wall, ends: tuple[Met, Met], scale: Scale, edges: F
             starts, stops = ((edges[:, k : k + 2] == corner).all(axis=1) for k in (0, 2))
             away = np.concatenate((edges[starts, 2:] - corner, edges[stops, :2] - corner))
             is_sharp = sense * (away @ (ux, uy)) > -SHARP * np.hypot(away[:, 0], away[:, 1])
-            if is_sharp.any() or per_mm * run.length * off * off >= PRICES.edge:
+            if is_sharp.any() or scale.against(run, off) >= PRICES.edge:
                 continue
             if id(run) not in moves or abs(off) < abs(moves[id(run)][0]):
                 moves[id(run)] = off, run

@@ -90,20 +90,19 @@ def divided(
 def _chords(units: RoofPartition, outline_mm: MultiPolygon, edges: FloatArray, spacing_m: float) -> list[FloatArray]:
     """The walls between units, (n, 2) each; their ends lie on the outline, edges (e, 4), or on other walls."""
     scale = Scale.of(spacing_m)
-    most = max(_IN_LINE_MM, scale.spacing_mm)
     walls = []
     for border in _through(_borders(units, shapely.buffer(outline_mm, scale.beyond_mm))):
         near = edges[shapely.distance(LineString(border), shapely.linestrings(edges.reshape(-1, 2, 2))) <= _NEARBY_MM]
         directions = pairs_of(peaks_of(_edge_runs(near)))
         walls.append(Wall(border, directions, _described(border, directions, scale)))
-    _put_in_line(walls, edges, most)
+    _put_in_line(walls, edges, scale)
     lines = [wall.line(scale) for wall in walls]
     for k, wall in enumerate(walls):
         # what it ends on is known once all are drawn
         ends = directions_beside(wall.border[[0, -1]], obstacles_of(edges, lines, k))
         walls[k] = dataclasses.replace(wall, runs=_described(wall.border, wall.directions, scale, ends))
         end_outside(walls[k].runs, outline_mm)
-    _put_in_line(walls, edges, most)
+    _put_in_line(walls, edges, scale)
     for change in (without_stubs, functools.partial(put_through_corner, edges=edges)):
         lines = [wall.line(scale) for wall in walls]
         for k, wall in enumerate(walls):
@@ -235,20 +234,24 @@ def _way_from(border: FloatArray, at_start: bool) -> FloatArray:
     return np.asarray(way / max(math.hypot(*way.tolist()), 1e-9))
 
 
-def _put_in_line(walls: Sequence[Wall], edges: FloatArray, most_mm: float) -> None:
-    """Move walls onto the line of a parallel edge, or longer wall, that they nearly continue; the longest first."""
+def _put_in_line(walls: Sequence[Wall], edges: FloatArray, scale: Scale) -> None:
+    """Move walls onto the line of a parallel edge, or longer wall, that they nearly continue; the longest first.
+
+    A wall moves if its points speak less against it than two edges cost: its own one, and the step between both lines.
+    """
     middle = 0.5 * (edges[:, :2] + edges[:, 2:])
     ways = edges[:, 2:] - edges[:, :2]
     lengths = np.hypot(ways[:, 0], ways[:, 1])
     long = lengths >= _SHORTEST_MM
     known = np.column_stack((middle, ways / np.maximum(lengths, 1e-9)[:, None], lengths))[long]
+    near_mm = max(_IN_LINE_MM, scale.spacing_mm)
     for run in sorted((run for wall in walls for run in wall.runs), key=lambda run: (-run.length, run.x, run.y)):
         ux, uy = math.cos(run.direction), math.sin(run.direction)
         dx, dy = known[:, 0] - run.x, known[:, 1] - run.y
         off, along = ux * dy - uy * dx, ux * dx + uy * dy
         gap = np.abs(along) - 0.5 * (known[:, 4] + run.length)
-        fits = (np.abs(ux * known[:, 3] - uy * known[:, 2]) <= _PARALLEL) & (np.abs(off) <= most_mm)
-        fits &= gap <= _IN_LINE_GAP_MM
+        fits = (np.abs(ux * known[:, 3] - uy * known[:, 2]) <= _PARALLEL) & (np.abs(off) <= near_mm)
+        fits &= (gap <= _IN_LINE_GAP_MM) & (scale.against(run, off) < 2.0 * PRICES.edge)
         if fits.any():
             nearest = float(off[fits][np.argmin(np.abs(off[fits]))])
             run.x -= nearest * uy
