@@ -173,6 +173,8 @@ def least_description(
     live[0] = 0
     alive = 1
     spare = prices.edge + prices.free + prices.change + max(prices.sharp, prices.flat)
+    if not math.isnan(met[1]):  # the last edge has the price of its end, too
+        spare += prices.change + max(prices.sharp, prices.flat)
     for j in range(1, m):
         reached = np.full(alive, np.inf)
         # the start that won last goes first: few of the others then need their angles
