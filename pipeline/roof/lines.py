@@ -35,8 +35,8 @@ class Run:
     """From the first to the last vertex."""
     exact: bool = False
     """Whether the line, or its direction, is known otherwise than by the stretch."""
-    own: float = 0.0
-    """Direction of the stretch alone, where `fitted_runs` found it, radians."""
+    own: float = math.nan
+    """Direction of the stretch alone, radians; known where `fitted_runs` found it."""
 
 
 def fitted_run(border: FloatArray, first: int, last: int) -> Run:

@@ -121,9 +121,9 @@ def _closed_alone(outline: MultiPolygon) -> list[shapely.Geometry]:
 
 
 def _common_mm(piece: Polygon, outline_mm: MultiPolygon) -> float:
-    """How far the border of a piece runs along an outline, within the rounding."""
+    """How far the borders of a piece run along an outline, within the rounding."""
     beside = shapely.buffer(outline_mm, _ROUNDING_MM, join_style="mitre")
-    return float(shapely.length(shapely.intersection(piece.exterior, beside)))
+    return float(shapely.length(shapely.intersection(piece.boundary, beside)))
 
 
 def closed(

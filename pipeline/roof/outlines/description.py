@@ -179,7 +179,8 @@ def least_description(
     # the starts of edges that may still win, by direction and without one, and what they cost up to here
     live, alive = np.zeros((d + 1, m), np.int64), np.ones(d + 1, np.int64)
     costs = np.empty((d + 1, m))
-    spare = prices.change + max(prices.sharp, prices.flat)
+    # with another start one turn may cost less, and the end, where it has a price
+    spare = (2 - math.isnan(met[1])) * (prices.change + max(prices.sharp, prices.flat))
     for j in range(1, m):
         for k in range(d + 1):
             # the start that won last goes first: few of the others then need more than their costs

@@ -39,8 +39,8 @@ _BREAK_SPACINGS = 0.45
 """Edges end at vertices that are this far apart at least."""
 _FACTORS = (1.0, 0.6, 0.35)
 """Times the noise: an outline that cannot be drawn with few edges is tried with more."""
-_FEW_POINTS, _FEW_SPACING_M = 150, 2.0
-"""So few points, so far apart, show directions badly: outlines in all directions are compared."""
+_FEW_POINTS, _FEW_SPACING_M, _FEWEST_POINTS = 150, 2.0, 30
+"""So few points, so far apart, show directions badly, and fewer anywhere: outlines in all directions are compared."""
 _FEWEST, _FEW_BREAKS = 4, 60
 """A ring of so few breaks has four edges at least."""
 _APART = math.radians(8.0)
@@ -132,7 +132,7 @@ def _straight_rings(
     noise_mm = max(noise_m[0] * 1e3, least_mm)
     rings = [_Ring(border, breaks_of(border, _BREAK_SPACINGS * spacing_m * 1e3)) for border in borders]
     least = max(_LEAST_SPACINGS * spacing_m, _LEAST_M) * 1e3
-    if points is not None and len(points.xy_mm) <= _FEW_POINTS and spacing_m >= _FEW_SPACING_M:
+    if points is not None and len(points.xy_mm) <= (_FEW_POINTS if spacing_m >= _FEW_SPACING_M else _FEWEST_POINTS):
         drawn[0] = _of_few_points(rings[0], points, noise_mm, least)
     for factor in _FACTORS:
         if all(ring is not None for ring in drawn):

@@ -65,6 +65,11 @@ class Scale:
         )  # fmt: skip
         return cls(*(1e3 * max(share * spacing_m, least_m) for share, least_m in shares))
 
+    @property
+    def per_mm(self) -> float:
+        """Nats by which points speak against moving an edge, per millimetre of it and square millimetre of the way."""
+        return 0.5 / (self.spacing_mm * self.noise_mm**2)
+
 
 @dataclasses.dataclass(frozen=True)
 class Wall:
@@ -181,7 +186,6 @@ def put_through_corner(wall: Wall, ends: tuple[Met, Met], scale: Scale, edges: F
     An end moves if its points speak less against it than an edge costs, and if no angle at the corner is sharp. A
     wall of one edge moves to one corner, the nearer one.
     """
-    per_mm = 0.5 / (scale.spacing_mm * scale.noise_mm**2)
     moves: dict[int, tuple[float, Run]] = {}
     for end, sense in ((0, 1.0), (-1, -1.0)):
         run, one = wall.runs[end], ends[end]
@@ -190,7 +194,7 @@ def put_through_corner(wall: Wall, ends: tuple[Met, Met], scale: Scale, edges: F
         ux, uy = math.cos(run.direction), math.sin(run.direction)
         for x, y in edges[one[1]].reshape(2, 2).tolist():
             off = ux * (y - run.y) - uy * (x - run.x)
-            if per_mm * run.length * off * off >= PRICES.edge or _is_sharp(x, y, sense * ux, sense * uy, edges):
+            if scale.per_mm * run.length * off * off >= PRICES.edge or _is_sharp(x, y, sense * ux, sense * uy, edges):
                 continue
             if id(run) not in moves or abs(off) < abs(moves[id(run)][0]):
                 moves[id(run)] = off, run

@@ -96,21 +96,20 @@ def _chords(
 ) -> list[FloatArray]:
     """The walls along borders between units, (n, 2) each; they end on the outline, edges (e, 4), or on other walls."""
     scale = Scale.of(spacing_m)
-    most = max(_IN_LINE_MM, scale.spacing_mm)
     walls = []
     pieces = shapely.linestrings(edges.reshape(-1, 2, 2))
     for border in _through(borders):
         near = edges[shapely.distance(LineString(border), pieces) <= _NEARBY_MM]
         directions = pairs_of(peaks_of(_edge_runs(near)))
         walls.append(Wall(border, directions, _described(border, directions, scale)))
-    _put_in_line(walls, edges, most)
+    _put_in_line(walls, edges, scale)
     obstacles = obstacles_of(edges, [wall.line(scale) for wall in walls])
     for k, wall in enumerate(walls):
         # what it ends on is known once all are drawn
         ends = directions_beside(wall.border[[0, -1]], obstacles, k)
         walls[k] = dataclasses.replace(wall, runs=_described(wall.border, wall.directions, scale, ends))
         end_outside(walls[k].runs, outline_mm)
-    _put_in_line(walls, edges, most)
+    _put_in_line(walls, edges, scale)
     for change in (without_stubs, functools.partial(put_through_corner, edges=edges)):
         lines = [wall.line(scale) for wall in walls]
         obstacles = obstacles_of(edges, lines)
@@ -249,19 +248,23 @@ def _way_from(border: FloatArray, at_start: bool) -> float:
     return math.atan2(y - start[1], x - start[0])
 
 
-def _put_in_line(walls: Sequence[Wall], edges: FloatArray, most_mm: float) -> None:
-    """Move walls onto the line of a parallel edge, or longer wall, that they nearly continue; the longest first."""
+def _put_in_line(walls: Sequence[Wall], edges: FloatArray, scale: Scale) -> None:
+    """Move walls onto the line of a parallel edge, or longer wall, that they nearly continue; the longest first.
+
+    A wall moves if its points speak less against it than two edges cost: its own one, and the step between both lines.
+    """
     runs = sorted((run for wall in walls for run in wall.runs), key=lambda run: (-run.length, run.x, run.y))
     lines = np.array([(run.x, run.y, math.cos(run.direction), math.sin(run.direction), run.length) for run in runs])
-    for run, (x, y) in zip(runs, _in_line(edges, lines.reshape(-1, 5), most_mm).tolist(), strict=True):
+    moved = _in_line(edges, lines.reshape(-1, 5), max(_IN_LINE_MM, scale.spacing_mm), scale.per_mm).tolist()
+    for run, (x, y) in zip(runs, moved, strict=True):
         run.x, run.y = x, y
 
 
 @kernel
-def _in_line(edges: FloatArray, lines: FloatArray, most: float) -> FloatArray:
+def _in_line(edges: FloatArray, lines: FloatArray, most: float, per_mm: float) -> FloatArray:
     """Where the middles of some lines move, (n, 2): onto the nearest of the edges (e, 4) and lines before them.
 
-    Lines (n, 5) are their middle, unit vector and length.
+    Lines (n, 5) are their middle, unit vector and length; `per_mm` as in `Scale`.
     """
     known = np.empty((len(edges) + len(lines), 5))
     count = 0
@@ -278,8 +281,8 @@ def _in_line(edges: FloatArray, lines: FloatArray, most: float) -> FloatArray:
         for k in range(count):
             dx, dy = known[k, 0] - x, known[k, 1] - y
             off, gap = ux * dy - uy * dx, abs(ux * dx + uy * dy) - 0.5 * (known[k, 4] + length)
-            is_parallel = abs(ux * known[k, 3] - uy * known[k, 2]) <= _PARALLEL
-            if is_parallel and abs(off) <= most and gap <= _IN_LINE_GAP_MM and not abs(off) >= abs(nearest):
+            fits = abs(ux * known[k, 3] - uy * known[k, 2]) <= _PARALLEL and abs(off) <= most and gap <= _IN_LINE_GAP_MM
+            if fits and per_mm * length * off * off < 2.0 * PRICES.edge and not abs(off) >= abs(nearest):
                 nearest = off
         known[count] = lines[r]
         if not np.isnan(nearest):

@@ -170,7 +170,7 @@ def _outlines_of(
 ) -> dict[str, MultiPolygon]:
     """The outlines, metres, of those of the first `owned` sites that end near others, by their building_id.
 
-    What fails without a known reason leaves its candidates as they are drawn alone, with a warning.
+    What fails without a known reason leaves its candidates as they are drawn alone, or cut, with a warning.
     """
     all_pairs = near_pairs(sites)
     compared = set(all_pairs[all_pairs[:, 0] < owned].ravel().tolist())
@@ -214,6 +214,9 @@ def _outlines_of(
         parts = _or_warned(warnings, (sites[i], sites[j]), functools.partial(of_pair, i, j))
         if parts is not None:
             kept[i][j], kept[j][i] = parts
+        else:  # the first by id has all of the overlap
+            one, other = sorted((i, j), key=lambda k: sites[k].building_id)
+            kept[one][other], kept[other][one] = drawn[one], _apart(drawn[other], [drawn[one]])
     outlines = {}
     for k in np.unique(near).tolist():
         if k < owned:
@@ -224,7 +227,9 @@ def _outlines_of(
             ]
             cut = functools.partial(left_of, drawn[k], limits, task.roof.min_part_area_m2)
             apart = _or_warned(warnings, (sites[k],), cut)
-            outlines[sites[k].building_id] = shapely.transform(drawn[k] if apart is None else apart, lambda xy: xy / MM)
+            if apart is None:
+                apart = _apart(drawn[k], [kept[j][k] for j in kept[k] if j != k])
+            outlines[sites[k].building_id] = shapely.transform(apart, lambda xy: xy / MM)
     return outlines
 
 
@@ -255,6 +260,11 @@ class _Extents:
         first, second = self._pairs[(self._pairs == k).any(axis=1)].T
         gap = -self._farthest[first] - np.roll(self._farthest[second], _DIRECTIONS // 2, axis=1)
         return bool((gap <= (self._reach[first] + self._reach[second] + _BESIDE_MM)[:, None]).all(axis=1).any())
+
+
+def _apart(outline_mm: MultiPolygon, others: Sequence[MultiPolygon]) -> MultiPolygon:
+    """An outline without others, whatever corners that leaves: models do not overlap even after a fault."""
+    return MultiPolygon([part for one in outline_mm.geoms for part in without(one, np.array(others, dtype=object))])
 
 
 def _taken(
@@ -371,7 +381,7 @@ def _or_warned(warnings: list[str], sites: Sequence[CandidateSite], draw: Callab
         raise
     except Exception as error:  # noqa: BLE001 - becomes a warning of the run
         names = ", ".join(site.building_id for site in sites)
-        warnings.append(f"the outlines of {names} are drawn without regard to others: {type(error).__name__}: {error}")
+        warnings.append(f"the outlines of {names} are not fitted to others: {type(error).__name__}: {error}")
         return None
 
 

@@ -67,6 +67,23 @@ def test_evenly_spread_points_show_an_oblique_wall_that_points_at_random_do_not(
     assert corners["even"] > 10 > 1 > corners["at random"]
 
 
+def test_the_outline_of_twenty_points_leaves_hardly_one_outside() -> None:
+    outside, share = 0, []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        x, y = rng.uniform((0, 0), (6, 5), (20, 2)).T
+        turn = np.exp(1j * rng.uniform(0.0, 3.0))
+        xy = np.rint(1e3 * turn * (x + 1j * y))
+        points = np.column_stack((xy.real, xy.imag, np.full(20, 6e3))) / 1e3
+        candidate = Candidate(building_id="a", origin=(0, 0, 0), points=points, ground=np.zeros((0, 3)), ground_z_m=0.0)
+        drawn = drawn_outline(roof_points(prepare_cloud(candidate, 10**6), SETTINGS), SETTINGS)
+        outside += np.count_nonzero(shapely.distance(drawn, shapely.points(xy.real, xy.imag)) > 100.0)
+        corners = turn * np.array([0, 6, 6 + 5j, 5j])
+        share.append(overlap(drawn, Polygon(np.column_stack((corners.real, corners.imag)))))
+    assert outside < 3
+    assert np.mean(share) > 0.78
+
+
 def test_a_ragged_l_keeps_its_inner_corner() -> None:
     truth = shapely.union_all([shapely.box(0, 0, 16, 6), shapely.box(0, 0, 6, 14)])
     drawn = straighten(ragged(truth, 0.4, np.random.default_rng(1)), 0.4, SETTINGS)

@@ -98,3 +98,12 @@ def test_an_outline_and_what_it_takes_are_on_the_grid_without_hairlines() -> Non
     assert (places == np.rint(places)).all()
     assert (np.hypot(*np.diff(places, axis=0).T) > 0.0).all()
     assert grown.area == pytest.approx(shed.area + slit.area_mm.area, rel=1e-3)
+
+
+def test_a_slit_all_around_a_shed_in_a_court_is_closed() -> None:
+    house = MultiPolygon([outline(0, 0, 20, 20).geoms[0].difference(outline(6, 6, 12, 11).geoms[0])])
+    shed = outline(6.4, 6.3, 11.5, 10.6)
+    (slit,) = slits((house, shed), between(house, shed), EVERYWHERE, (), ())
+    both = [united(one, pieces) for one, pieces in zip((house, shed), closed(house, shed, [slit]), strict=True)]
+    assert shapely.union_all(both).area == pytest.approx(400e6, rel=1e-3)
+    assert shapely.intersection(*both).area < 3e3

@@ -127,3 +127,11 @@ def test_a_wall_ends_at_the_inner_corner_of_an_outline(seed: int) -> None:
     corner = corners[int(np.argmin(shapely.distance(corners, shapely.Point(12, 9))))]
     assert shapely.distance(corner, shapely.Point(12, 9)) < 1.0
     assert shapely.distance(corner, shapely.intersection(*both, grid_size=0.001)) < 0.02
+
+
+@pytest.mark.parametrize(("off_m", "wall_x_m"), [(0.2, 10.2), (0.45, 10.0)])
+def test_a_wall_moves_in_line_with_an_edge_only_as_far_as_its_points_allow(off_m: float, wall_x_m: float) -> None:
+    roof = Polygon([(0, 0), (20, 0), (20, 10), (10 + off_m, 10), (10 + off_m, 16), (0, 16)])
+    candidate, unit = two_units(roof, LineString([(10, 0), (10, 10)]), 10.0, 4)
+    common = shapely.intersection(*unit_outlines(candidate, unit, RoofSettings()), grid_size=0.001)
+    assert np.abs(shapely.get_coordinates(common)[:, 0] - wall_x_m).max() < 0.1

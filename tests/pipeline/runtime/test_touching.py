@@ -13,6 +13,7 @@ from plain_houses import Houses, write_houses
 from run_tables import rows
 
 from pipeline.runtime.run import RunSummary
+from pipeline.runtime.stages import touching
 from pipeline.runtime.stages.sites import CandidateSite, near_pairs
 from pipeline.runtime.stages.stored_sites import SitesBrief, may_touch
 from pipeline.runtime.stages.touching import _Extents, _or_warned
@@ -174,7 +175,7 @@ def test_a_fault_that_nothing_foresaw_is_a_warning_and_a_known_one_is_passed_on(
 
     assert _or_warned(warnings, (site,), lambda: 3) == 3
     assert _or_warned(warnings, (site,), lambda: fails(ZeroDivisionError("by zero"))) is None
-    assert warnings == ["the outlines of shed are drawn without regard to others: ZeroDivisionError: by zero"]
+    assert warnings == ["the outlines of shed are not fitted to others: ZeroDivisionError: by zero"]
     with pytest.raises(OSError, match="scratch"):
         _or_warned(warnings, (site,), lambda: fails(OSError("scratch")))
 
@@ -203,3 +204,41 @@ def test_sites_that_are_apart_across_any_direction_do_not_come_near() -> None:
     extents.set(1, shapely.get_coordinates(turned[1]) * 1e3, 200.0)
     assert extents.come_near(1)
     assert extents.come_near(0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fails", ["divided", "left_of"])
+def test_models_do_not_overlap_after_a_fault_of_a_division(
+    fails: str, sheds: Path, reconstruct: Callable[..., RunSummary], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise ZeroDivisionError("by zero")
+
+    monkeypatch.setattr(touching, fails, fail)
+    drawn = reconstruct(sheds, settings=TRUSTED)
+    assert any("are not fitted to others: ZeroDivisionError" in warning for warning in drawn.warnings)
+    assert drawn.statuses["ok"] == 4
+    assert max(overlaps_m2(drawn.run_dir)) < NOTHING_M2
+
+
+@pytest.mark.slow
+def test_units_of_a_block_that_others_own_lie_beside_slits(
+    tmp_path: Path, reconstruct: Callable[..., RunSummary]
+) -> None:
+    """Two units of a block face a house over a slit; all three, and a shed far away, have tiles of their own."""
+    random = np.random.default_rng(7)
+    x, y = random.uniform((-14.0, -14.0), (40.0, 32.0), (20_000, 2)).T
+    z, kind = np.full(len(x), 50.0), np.full(len(x), 2, np.uint8)
+    units, house, shed = ((18, 12, 27, 20, 57), (27, 12, 36, 20, 62)), (16.5, 20.7, 30, 27, 54), (-12, -12, -5, -5, 53)
+    for x0, y0, x1, y1, top in (*units, house, shed):
+        inside = (x > x0) & (x < x1) & (y > y0) & (y < y1)
+        z[inside], kind[inside] = top, 6
+    slit = (x >= 16.5) & (x <= 30.0) & (y > 20.0) & (y < 20.7)
+    z[slit], kind[slit] = 53.0, 1
+    z += random.normal(0.0, 0.02, len(x))
+    found = Houses(xyz=np.column_stack((x + 4e5, y + 5.7e6, z)), house=np.zeros(len(x), np.int8))
+    cloud = write_houses(tmp_path / "block.laz", found, classes=kind)
+    whole = reconstruct(cloud, settings={**TRUSTED, "tile_size_m": 1000.0})
+    assert whole.statuses["ok"] == 4
+    tiles = {"tile_size_m": 24.0, "lattice_x_m": 16.0, "lattice_y_m": 20.3}
+    assert reconstruct(cloud, settings={**TRUSTED, **tiles}).digest == whole.digest
