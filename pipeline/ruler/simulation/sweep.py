@@ -41,10 +41,10 @@ SCANNER = ScannerSettings(altitude_m=800.0, strip_spacing_m=_STRIP_M, strip_over
 def cell_name(density_per_m2: float, noise_m: float) -> str:
     """Folder of a cell.
 
-    >>> cell_name(0.5, 0.1)
-    'd0.5_n0.10'
+    >>> cell_name(0.5, 0.1), cell_name(8.0, 0.005)
+    ('d0.5_n0.10', 'd8_n0.005')
     """
-    return f"d{density_per_m2:g}_n{noise_m:.2f}"
+    return f"d{density_per_m2:g}_n{max(f'{noise_m:.2f}', f'{noise_m:g}', key=len)}"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
