@@ -12,7 +12,6 @@ from collections.abc import Iterable, Sequence
 from pipeline.export.solid_geometry import model_at
 from pipeline.export.stored_coordinates import SpatialReference, crs_coordinates, decimals
 from pipeline.model import BuildingResult, FaceKind, FloatArray, Solid, SolidFace
-from pipeline.triangulation import triangulate_face
 
 _KINDS = (FaceKind.ROOF, FaceKind.WALL, FaceKind.GROUND, FaceKind.CEILING)
 
@@ -72,5 +71,7 @@ def _polygons(solid: Solid, face: SolidFace) -> Sequence[Sequence[int]]:
     """The face's outer ring, or its triangles where it has holes."""
     if len(face.rings) == 1:
         return face.rings
+    from pipeline.triangulation.one_face import triangulate_face  # few faces have holes
+
     triangles: list[list[int]] = triangulate_face(solid.vertices, face.rings).tolist()
     return triangles

@@ -28,14 +28,6 @@ _FEW = 4
 """Sides of a hip roof."""
 _MAIN = 0.6
 """Share of the sloping faces from which a part of them decides alone."""
-_END_REACH = 0.7
-"""Share of the height of the roof over which an end falls that is not half a hip's."""
-_POINT = 0.04
-"""Ridges shorter than this share of the hips are a point."""
-_LEAST_KINK = 0.15
-"""Share of a side's area that the flatter and the steeper face of a gambrel have at least."""
-_STEEP_DEG = 45.0
-"""Slope of the sides of a mansard under a flat top."""
 
 
 def roof_type(
@@ -116,11 +108,13 @@ def _named(roof: Roof, main: Sequence[int], tops: Sequence[int]) -> RoofType:
         return RoofType.COMBINATION
     if second is None:
         return _of_one_side(roof, first, ends, total)
-    kinked = all(_is_kinked(roof, side) for side in pair)
-    if ends:
-        return _hipped(roof, pair, ends, tops, is_kinked=kinked)
+    if ends or len(first.planes) > 1:
+        from pipeline.roof.hipped_roofs import hipped_or_bent
+
+        if (name := hipped_or_bent(roof, pair, ends, tops)) is not None:
+            return name
     has_ridge = roof.length(roof.ridges, first, second) > 0.0
-    if kinked or (tops and not has_ridge):
+    if tops and not has_ridge:
         return RoofType.GAMBREL
     if has_ridge:
         return RoofType.GABLE
@@ -138,34 +132,3 @@ def _of_one_side(roof: Roof, side: Side, ends: Sequence[Side], total: float) -> 
     if side.area >= (1.0 - roof.settings.minor_share_together) * total:
         return RoofType.PENT
     return RoofType.HIP if len(ends) > 1 else RoofType.COMBINATION
-
-
-def _hipped(
-    roof: Roof, pair: Sequence[Side], ends: Sequence[Side], tops: Sequence[int], *, is_kinked: bool
-) -> RoofType:
-    """The type of a roof with two opposite sides and at least one end."""
-    mains = [p for side in pair for p in side.planes]
-    least = roof.high(mains) - _END_REACH * (roof.high(mains) - roof.low(mains))
-    whole = [end for end in ends if roof.low(end.planes) <= least]
-    if not whole:
-        return RoofType.GAMBREL if is_kinked else RoofType.HALF_HIP
-    if is_kinked:
-        return RoofType.MANSARD
-    if tops:
-        steep = math.fsum(roof.planes[p].slope_deg * roof.areas[p] for p in mains) >= _STEEP_DEG * roof.area(mains)
-        return RoofType.MANSARD if steep else RoofType.HIP
-    hips = math.fsum(roof.length(roof.ridges, end, side) for end in whole for side in pair)
-    is_point = roof.length(roof.ridges, *pair) < _POINT * hips
-    return RoofType.PYRAMID if len(whole) > 1 and is_point else RoofType.HIP
-
-
-def _is_kinked(roof: Roof, side: Side) -> bool:
-    """Whether a side has a steeper face below a flatter one, each with a good share of its area."""
-    for p in side.planes:
-        for q in side.planes:
-            steeper_deg = roof.planes[q].slope_deg - roof.planes[p].slope_deg
-            if steeper_deg >= roof.settings.slope_tolerance_deg and (p, q) in roof.ridges:
-                least = _LEAST_KINK * side.area
-                if roof.areas[p] >= least and roof.areas[q] >= least:
-                    return True
-    return False

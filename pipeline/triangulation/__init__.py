@@ -6,7 +6,3 @@ orientation test is exact. Holes are joined to the outer ring by bridges, the re
 triangles away from vertices that lie on a straight edge, so that rounding hardly turns the normals. Cocircular ties
 go to the diagonal with the smaller coordinates, so that the result does not depend on where a ring starts.
 """
-
-from pipeline.triangulation.face_triangles import triangulate_face
-
-__all__ = ["triangulate_face"]

@@ -7,7 +7,8 @@ from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from pipeline.errors import RunCancelledError
-from pipeline.runtime.compiling import RECONSTRUCT, STAGE, compile_first
+from pipeline.runtime.compile_listed import STAGE
+from pipeline.runtime.compiling import RECONSTRUCT, compile_first
 from pipeline.runtime.monitoring.progress import Event, Listener
 from service.driver.leased_job import LOG, LeasedJob
 from service.jobs import JobRequest

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.model import FloatArray, IntArray
-from pipeline.triangulation import triangulate_face
+from pipeline.triangulation.one_face import triangulate_face
 
 Ring = tuple[int, ...]
 

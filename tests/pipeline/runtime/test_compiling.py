@@ -14,7 +14,7 @@ from command_line import invoke
 from pipeline.compiler import store, warm_up
 from pipeline.compiler.warm_up import Listed, about_s
 from pipeline.errors import RunError
-from pipeline.runtime import compiling
+from pipeline.runtime import compile_listed, compiling
 from pipeline.runtime.compiling import RECONSTRUCT, compile_first, compiling_s, kernel_groups, missing_kernels
 from pipeline.runtime.monitoring.progress import Event
 
@@ -53,6 +53,7 @@ def said(monkeypatch: pytest.MonkeyPatch, groups: tuple[str, ...] = RECONSTRUCT,
 
 def test_the_first_word_says_what_is_done_once_and_for_how_long(cold: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(compiling, "cores", lambda: 2)
+    monkeypatch.setattr(compile_listed, "cores", lambda: 2)
     first, *rest = said(monkeypatch)
     kernels = warm_up.listed(RECONSTRUCT)
     assert (first.kind, first.stage, first.total) == ("stage", "compile", len(kernels))
