@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterable, Sequence
 from itertools import product
 
-from pipeline.model import FaceKind, Plane, Solid, SolidFace
+from pipeline.model import FaceKind, Plane, RoofType, Solid, SolidFace
 from pipeline.roof.roof_settings import RoofTypeSettings
 
 HALF = 0.5
@@ -124,3 +124,10 @@ def _height_m(vertices: Sequence[tuple[float, float, float]], face: SolidFace) -
         low, high = ends.get((x, y), (z, z))
         ends[x, y] = min(low, z), max(high, z)
     return max(high - low for low, high in ends.values())
+
+
+def opposite(roof: Roof, first: Side, second: Side) -> RoofType:
+    """The type of two opposite sides alone: a gable with a ridge, a butterfly with a valley."""
+    if roof.length(roof.ridges, first, second) > 0.0:
+        return RoofType.GABLE
+    return RoofType.BUTTERFLY if roof.length(roof.bends, first, second) > 0.0 else RoofType.COMBINATION

@@ -6,26 +6,21 @@ pairs (Hofmann, Maas and Streilein 2003). The finer names follow the list of roo
 - The *main roof* decides: the largest part whose sloping faces meet. Flat faces count with it where they lie on top of
   it; others are annexes, and the roof is flat where these have half of the area.
 - A *side* is all faces of one direction. Two opposite sides with a ridge are a gable, with a valley a butterfly.
-- A side square to them is an *end* where it meets one of them in a hip. Ends that begin well above the eaves make a
-  half-hip; ends that meet in a point, a pyramid.
-- Where both sides have a steeper lower face the roof is a gambrel, with such ends a mansard.
-- Valleys between sides square to each other are those of wings: one for an L, two for a T, four for a cross. Short ones
-  are those of dormers.
-- Three slopes of one direction behind one another are a sawtooth.
+  `many_sided_roofs` names the others.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from itertools import combinations, permutations, product
+from itertools import combinations
 
 from pipeline.model import Plane, RoofFace, RoofType, Solid
 from pipeline.roof.roof_settings import RoofTypeSettings
-from pipeline.roof.roof_sides import HALF, LEAST_END, Roof, Side, corners_of, folds, turn_deg
+from pipeline.roof.roof_sides import HALF, Roof, Side, corners_of, folds, opposite, turn_deg
 
-_FEW = 4
-"""Sides of a hip roof."""
+_FEW = 2
+"""Faces of a gable."""
 _MAIN = 0.6
 """Share of the sloping faces from which a part of them decides alone."""
 
@@ -68,7 +63,7 @@ def _main_roof(roof: Roof, slopes: list[int]) -> list[int]:
 
 
 def _sides(roof: Roof, slopes: Sequence[int]) -> list[Side]:
-    """Sloping planes by direction, largest first; of two directions nearly as near, that of the larger plane."""
+    """Sloping planes by direction, the largest side first; a plane joins the first side that it fits."""
     sides: list[Side] = []
     for p in sorted(slopes, key=lambda p: (-roof.areas[p], p)):
         aspect_deg = roof.planes[p].aspect_deg
@@ -85,50 +80,11 @@ def _sides(roof: Roof, slopes: Sequence[int]) -> list[Side]:
 def _named(roof: Roof, main: Sequence[int], tops: Sequence[int]) -> RoofType:
     """The type of the main roof, with its flat tops."""
     total = roof.area(main) + roof.area(tops)
-    sides = _sides(roof, main)
-    if len(sides) > _FEW or len(sides[0].planes) >= _FEW - 1:
-        from pipeline.roof.compound_roofs import compound  # most roofs are simple
+    first, *others = sides = _sides(roof, main)
+    if len(main) > _FEW or tops:
+        from pipeline.roof.many_sided_roofs import name_of  # most roofs have one or two faces
 
-        if (name := compound(roof, sides, total)) is not None:
-            return name
-    first = sides[0]
-    second = next((one for one in sides if roof.turned(first, one, 180.0)), None)
-    if second is not None and second.area < roof.settings.minor_share * total and not tops:
-        second = None
-    pair = [first] if second is None else [first, second]
-    square = [one for one in sides if roof.turned(first, one, 90.0) and one.area >= LEAST_END * total]
-    if any((p, q) in roof.bends for side, other in product(pair, square) for p in side.planes for q in other.planes):
-        from pipeline.roof.compound_roofs import wings
-
-        if (name := wings(roof, pair, square, total)) is not None:
-            return name
-    ends = [one for one in square if any((p, q) in roof.ridges for p in one.planes for q in _mains(roof, pair))]
-    decided = math.fsum(side.area for side in pair + ends) + roof.area(tops)
-    if total - decided >= roof.settings.minor_share_together * total:
-        return RoofType.COMBINATION
-    if second is None:
-        return _of_one_side(roof, first, ends, total)
-    if ends or len(first.planes) > 1:
-        from pipeline.roof.hipped_roofs import hipped_or_bent
-
-        if (name := hipped_or_bent(roof, pair, ends, tops)) is not None:
-            return name
-    has_ridge = roof.length(roof.ridges, first, second) > 0.0
-    if tops and not has_ridge:
-        return RoofType.GAMBREL
-    if has_ridge:
-        return RoofType.GABLE
-    return RoofType.BUTTERFLY if roof.length(roof.bends, first, second) > 0.0 else RoofType.COMBINATION
-
-
-def _mains(roof: Roof, pair: list[Side]) -> list[int]:
-    """The planes of two sides that meet in ridges, else the largest of each: no fronts of dormers."""
-    opposite = [(p, q) for one, other in permutations(pair, 2) for p in one.planes for q in other.planes]
-    return [p for p, q in opposite if (p, q) in roof.ridges] or [side.planes[0] for side in pair]
-
-
-def _of_one_side(roof: Roof, side: Side, ends: Sequence[Side], total: float) -> RoofType:
-    """The type of a roof without an opposite side: a pent roof, or the half of a hip roof on one side of its ridge."""
-    if side.area >= (1.0 - roof.settings.minor_share_together) * total:
-        return RoofType.PENT
-    return RoofType.HIP if len(ends) > 1 else RoofType.COMBINATION
+        return name_of(roof, sides, total, tops)
+    if others and roof.turned(first, others[0], 180.0) and others[0].area >= roof.settings.minor_share * total:
+        return opposite(roof, first, others[0])
+    return RoofType.PENT if first.area >= (1.0 - roof.settings.minor_share_together) * total else RoofType.COMBINATION
