@@ -18,7 +18,7 @@ from pipeline.io.crs import SpatialReference
 from pipeline.io.crs_given import parse_crs
 from pipeline.model import BuildingResult
 from pipeline.ruler.evaluation.models import ModelSet, RoofModel
-from pipeline.triangulation import triangulate_face
+from pipeline.triangulation.one_face import triangulate_face
 
 Json = dict[str, Any]
 
