@@ -62,7 +62,7 @@ def data_uri(png: bytes) -> str:
 def drawn_path(rings: Sequence[FloatArray]) -> DrawnPath:
     """One path of outer rings and holes; the rings are (n, 2), the first vertex not repeated. Empty without rings."""
     if not rings:
-        return DrawnPath(np.zeros((1, 2)))
+        return DrawnPath(np.full((1, 2), np.nan))
     codes = []
     for ring in rings:
         code = np.full(len(ring) + 1, DrawnPath.LINETO, dtype=np.uint8)
@@ -77,6 +77,7 @@ def paths_of(geometries: Sequence[Any]) -> list[DrawnPath]:
 
 
 def plan_rings(geometry: Any) -> list[FloatArray]:
-    """All rings of a geometry in plan, closed, (n, 2) each; none of a missing one."""
-    rings = [] if geometry is None else shapely.get_rings(shapely.force_2d(geometry))
+    """All rings of a polygon or multipolygon in plan, closed, (n, 2) each; none of a missing one."""
+    # a multipolygon has no rings of its own
+    rings = [] if geometry is None else shapely.get_rings(shapely.get_parts(shapely.force_2d(geometry)))
     return [shapely.get_coordinates(ring) for ring in rings]

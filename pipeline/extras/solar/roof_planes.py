@@ -98,7 +98,9 @@ class RoofPlanes:
 
         Returns (m, 6) ends x, y, z, x, y, z and (m,) numbers of buildings, in order.
         """
-        rings, owner = shapely.get_rings(self.faces, return_index=True)
+        polygons, plane = shapely.get_parts(self.faces, return_index=True)
+        rings, part = shapely.get_rings(polygons, return_index=True)
+        owner = plane[part]
         xyz, ring = shapely.get_coordinates(rings, include_z=True, return_index=True)
         follows = ring[1:] == ring[:-1]
         start, end = xyz[:-1][follows], xyz[1:][follows]

@@ -238,7 +238,7 @@ def _beside_drawn(made: Geometries, found: Geometries, drawn: Geometries) -> Col
     columns |= {"compared": (iou >= MIN_IOU).astype(np.float64), **{name: np.zeros(count) for name in names}}
     columns |= {"away": np.zeros((count, len(AWAY_M) - 1)), "oblique_m": np.zeros(count)}
     columns["oblique_found_m"] = np.zeros(count)
-    rings = [shapely.get_coordinates(ring) for ring in shapely.get_rings(made)]
+    rings = [shapely.get_coordinates(ring) for ring in shapely.get_rings(shapely.get_parts(made))]
     edges = np.concatenate([np.zeros((0, 2, 2)), *(np.stack([ring[:-1], ring[1:]], axis=1) for ring in rings)])
     for k in np.flatnonzero(columns["compared"]).tolist():
         one, other = _block_corners(found[partner[k]]), _block_corners(drawn[k])

@@ -6,8 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import shapely
 import small_buildings as small
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import PathCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.image import imread
@@ -17,7 +19,7 @@ from pipeline.errors import RunError
 from pipeline.model import FaceKind, RoofType
 from pipeline.report.palette import ROOF_COLOURS
 from pipeline.report.perspective import MAP_SUN, View, ViewedFace, draw_view, lambert
-from pipeline.report.pictures import drawn_path
+from pipeline.report.pictures import drawn_path, paths_of
 from pipeline.report.render import FAILED_COLOUR, render_run
 
 TRUTH_COLOUR = "#0050a0"
@@ -142,6 +144,14 @@ def test_nearer_buildings_are_drawn_later() -> None:
         first, last = axes.collections[1].get_facecolors()[:, :3]
         assert first.argmax() == 1
         assert last.argmax() == 0
+
+
+def test_faces_of_several_parts_are_drawn_and_missing_ones_take_no_room() -> None:
+    faces = shapely.MultiPolygon([shapely.box(100, 100, 110, 110), shapely.box(120, 100, 130, 110)])
+    axes = Figure().add_axes((0, 0, 1, 1))
+    axes.add_collection(PathCollection(paths_of([faces, None, shapely.Polygon()])))
+    assert axes.dataLim.extents.tolist() == [100.0, 100.0, 130.0, 110.0]
+    assert len(paths_of([faces])[0].vertices) == 10
 
 
 def test_a_court_is_a_hole_in_the_drawn_path() -> None:

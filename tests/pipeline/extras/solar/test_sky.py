@@ -1,5 +1,6 @@
 """What planes see of the sky, held against the formulas of theory and against a search along rays."""
 
+import dataclasses
 import math
 from typing import Any
 
@@ -213,6 +214,11 @@ def test_an_edge_between_two_faces_is_kept_once() -> None:
     )
     edges, building = planes.edges()
     assert len(edges) == len(building) == 7
+    both = dataclasses.replace(
+        planes, faces=np.array([shapely.MultiPolygon(faces), None], dtype=object), building=np.array([0, 7])
+    )
+    assert (both.edges()[0] == edges).all()
+    assert both.edges()[1].tolist() == [0] * 7
     # side by side, so that the shared edge is the last of the first building and the first of the second
     turned = shapely.transform(planes.faces, lambda xyz: xyz[:, [1, 0, 2]], include_z=True)
     others = RoofPlanes(**{**vars(planes), "faces": turned, "building": np.array([0, 1])})

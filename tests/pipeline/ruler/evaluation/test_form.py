@@ -190,6 +190,8 @@ def test_a_drawn_oblique_edge_is_found_by_an_edge_of_its_direction_alone() -> No
     assert denominators([shed("a", cut)], outlines)["oblique_found"] == round(math.hypot(4, 4))
     for ring, share in ((cut, 1.0), ([(x + 0.5, y) for x, y in cut], 1.0), (rectangle(0, 0, 10, 8), 0.0)):
         assert form([shed("a", ring)], outlines)["oblique_found"] == share
+    apart = [surface(ring, (0.0, 0.0, 6.0)) for ring in (cut, rectangle(20, 0, 24, 4))]
+    assert form([model("a", RoofType.FLAT, apart)], outlines)["oblique_found"] == 1.0
     half = [(0, 0), (10, 0), (10, 4), (8, 6), (8, 8), (0, 8)]  # and 1 m beyond its end
     assert form([shed("a", half)], outlines)["oblique_found"] == pytest.approx(
         (math.hypot(2, 2) + 1) / math.hypot(4, 4), abs=0.04
