@@ -134,6 +134,9 @@ def measured(given: argparse.Namespace, codes: dict[str, Path]) -> list[Judged]:
         if not (out / f"{given.split}{draw}" / cell.key / "truth" / "scene.json").exists():
             chosen = {"density_per_m2": cell.density_per_m2, "noise_m": cell.noise_m}
             simulate("broken_slopes", out / f"{given.split}{draw}", seed_of(given.split, draw), **chosen)
+        if given.given:
+            survey = out / f"{given.split}{draw}" / cell.key
+            write_outlines(survey / "truth", survey / "outlines.geojson")
 
     def one(task: tuple[int, Cell, str]) -> list[Judged]:
         draw, cell, code = task
@@ -141,8 +144,6 @@ def measured(given: argparse.Namespace, codes: dict[str, Path]) -> list[Judged]:
         run = folder / f"models-{code}{'-given' if given.given else ''}"
         if not (run / "run.json").exists():
             outlines = folder / "outlines.geojson" if given.given else None
-            if outlines and not outlines.exists():
-                write_outlines(folder / "truth", outlines)
             entry = Entry(
                 name=folder.name, tiles=(folder / "broken_slopes.laz",), classes="ignore", footprints=outlines
             )
@@ -183,6 +184,10 @@ def main() -> int:
     parser.add_argument("--baseline", type=Path, help="another checkout of this repository")
     given = parser.parse_args()
     codes = {path.name: path for path in (ROOT, given.baseline and given.baseline.resolve()) if path}
+    if given.baseline and len(codes) == 1:
+        parser.error(
+            f"--baseline {given.baseline} is called {ROOT.name}, as this checkout: give a folder of another name"
+        )
     rows = measured(given, codes)
     (given.out / f"{given.split}.json").write_text(json.dumps(list(map(dataclasses.asdict, rows))), encoding="utf-8")
     for code in codes:

@@ -48,7 +48,7 @@ _DIRECTIONS = 3
 _NEEDLE_MM = 120.0
 """Half the width of a part that is not left of an outline: no wing of a house is as narrow."""
 _LEAST_NEEDLE_MM2 = 0.5 * _NEEDLE_MM * _NEEDLE_MM
-"""What is smaller is no needle."""
+"""A smaller part is not a needle."""
 _SHORTEST_MM = 20.0
 """Corners nearer to each other are united when a solid is made, which would move a common border."""
 _PLAIN_MM = 3.0
@@ -295,8 +295,6 @@ def _without_needles(polygon: Polygon) -> list[Polygon]:
     """A polygon without parts that are narrower than two needle widths; nothing is left of one that is a needle."""
     inner = shapely.buffer(polygon, -_NEEDLE_MM, join_style="mitre", mitre_limit=_MITRE)
     opened = shapely.buffer(inner, _NEEDLE_MM, join_style="mitre", mitre_limit=_MITRE)
-    if polygon.area - opened.area < _LEAST_NEEDLE_MM2:
-        return [polygon]
     needles = [one for one in polygons_of(shapely.difference(polygon, opened)) if _is_needle(one)]
     return polygons_of(shapely.difference(polygon, MultiPolygon(needles), grid_size=1.0)) if needles else [polygon]
 

@@ -35,10 +35,11 @@ def fill_labels(xy_mm: IntArray, labels: LabelArray) -> LabelArray:
 def _far_samples(
     xy: IntArray, low: IntArray, shape: tuple[int, int], pitch: int, gap_m: float, beside: int
 ) -> IntArray:
-    """The samples (s, 2) of a lattice, row after row, farther than a gap from every point (n, 2), `beside` some.
+    """The samples (s, 2) of a lattice, row after row, farther than a gap from every point (n, 2).
 
-    It has some rows and columns from its lower left corner on. Every other row is shifted by half a pitch: an
-    equilateral lattice has no ties for the Delaunay triangulation.
+    They lie within `beside` cells of a cell that holds a point, or anywhere with -1. The lattice has some rows and
+    columns from its lower left corner on. Every other row is shifted by half a pitch: an equilateral lattice has no
+    ties for the Delaunay triangulation.
     """
     rows, columns = shape
     near = np.zeros((rows, columns), np.bool_)

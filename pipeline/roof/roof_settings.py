@@ -348,7 +348,7 @@ class RoofTypeSettings(Parameters):
     )
     slope_tolerance_deg: float = parameter(
         5.0,
-        "Slopes of one direction bend where they differ by this: gambrels and mansards.",
+        "Slopes of one direction bend where they differ by this (gambrels, mansards). Backs of saw teeth are steeper.",
         unit="deg",
         minimum=1.0,
         maximum=45.0,
@@ -361,7 +361,10 @@ class RoofTypeSettings(Parameters):
         maximum=5.0,
     )
     minor_share: float = parameter(
-        0.12, "Directions with a smaller share of the roof's area do not decide the type.", minimum=0.0, maximum=0.4
+        0.12,
+        "An opposite side, or wings, with a smaller share of the main roof do not decide its type.",
+        minimum=0.0,
+        maximum=0.4,
     )
     minor_share_together: float = parameter(
         0.20,

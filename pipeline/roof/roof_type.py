@@ -28,7 +28,7 @@ _MAIN = 0.6
 def roof_type(
     planes: Sequence[Plane], faces: Sequence[RoofFace], solids: Sequence[Solid], settings: RoofTypeSettings
 ) -> RoofType:
-    """The type of a delivered roof; `solids` show where its faces meet.
+    """The type of a delivered roof; `solids`, which hold all faces, show where they meet.
 
     It is `none` without faces and `combination` for a roof without a simpler name.
     """

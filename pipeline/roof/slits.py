@@ -30,10 +30,10 @@ _MARGIN_MM = 1.2
 """Width of a strip around it in which no other outline lies, even after rounding."""
 _MITRE = 1.5
 """Offset corners sharper than 84 degrees are cut: areas between outlines lie within three quarters of the gap."""
-_HELD = 256
-"""Outlines that stay in memory, closed."""
 _SHARP_MITRE = 10.0
 """The same at hairlines and margins: 12 degrees."""
+_HELD = 256
+"""Outlines that stay in memory, closed."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -4,7 +4,7 @@ The edges between two ends are found by dynamic programming over the vertices of
 edge may have (Bellman 1961; Perez and Vidal 1994 for polygons). The description costs nats, by the principle of minimum
 description length (Rissanen 1978): what the edges leave unexplained, the negative logarithm of a normal density, with
 one independent observation per point spacing; and a price per edge, per change of direction. A start of an edge is
-given up once it cannot win anywhere (Killick, Fearnhead and Eckley 2012), so the work grows little faster than the
+given up once it can hardly win (Killick, Fearnhead and Eckley 2012), so the work grows little faster than the
 border. A turn at an edge in a direction of its own is priced for the best edge before it, chosen without that turn.
 """
 

@@ -24,6 +24,8 @@ _OFF_MM = 120.0
 """Standard deviation of a point about the edge that it lies outside of."""
 _MOST = 8.0
 """Most that a point outside costs, nats: it may be no roof."""
+_FARTHEST = 3.0
+"""Point spacings by which a corner may lie outside of the ring before."""
 _STEP = math.radians(5.0)
 """Between the directions that are tried."""
 
@@ -109,6 +111,8 @@ def likeliest(
         ring = drawn(border, runs)
         polygon = None if ring is None else shapely.polygons(ring)
         if ring is None or polygon is None or polygon.area <= 0.0 or not polygon.is_valid:
+            continue
+        if shapely.distance(shapely.points(ring), raw).max() > _FARTHEST * spacing_mm:
             continue
         total = prices.edge * len(ring) + prices.free * sum(not run.exact for run in runs)
         off = shapely.distance(places, polygon)

@@ -97,10 +97,9 @@ def drawn_apart(context: RunContext, roof: RoofSettings, joined: Joined) -> Join
     """The candidates of a run, with outlines that neither overlap nor leave slits where they come near each other."""
     started = time.perf_counter()
     owned: dict[tuple[int, int], list[StoredGroup]] = collections.defaultdict(list)
-    owners = [group.figures.owner for group in joined.groups]
-    column0, row0 = min(owner.column for owner in owners), min(owner.row for owner in owners)
-    for owner, group in zip(owners, joined.groups, strict=True):
-        owned[(owner.column - column0) // _ACROSS, (owner.row - row0) // _ACROSS].append(group)
+    for group in joined.groups:
+        owner = group.figures.owner
+        owned[owner.column // _ACROSS, owner.row // _ACROSS].append(group)
     blocks = sorted(owned)
     reach = [box_around(group.figures.reach_mm for group in owned[block]) for block in blocks]
     boxes = np.array([None if box is None else shapely.box(*box) for box in reach], object)
@@ -197,7 +196,7 @@ def _outlines_of(
     def claim(k: int) -> Claim:
         points = stored_points(task.scratch, sites[k])
         places: IntArray = np.column_stack([points[axis] for axis in "xyz"]).astype(np.int64)
-        order = np.argsort(places[:, 0], kind="stable")
+        order = np.lexsort(places.T[::-1])
         return Claim(name=sites[k].building_id, outline_mm=drawn[k], points_mm=places[order])
 
     def of_pair(i: int, j: int) -> tuple[MultiPolygon, MultiPolygon]:
@@ -259,7 +258,7 @@ class _Extents:
         """Whether site k may come as near to another one as outlines are compared."""
         first, second = self._pairs[(self._pairs == k).any(axis=1)].T
         gap = -self._farthest[first] - np.roll(self._farthest[second], _DIRECTIONS // 2, axis=1)
-        return bool((gap <= (self._reach[first] + self._reach[second] + _BESIDE_MM)[:, None]).all(axis=1).any())
+        return bool((gap <= (self._reach[first] + self._reach[second] + _BESIDE_MM + 1.0)[:, None]).all(axis=1).any())
 
 
 def _apart(outline_mm: MultiPolygon, others: Sequence[MultiPolygon]) -> MultiPolygon:

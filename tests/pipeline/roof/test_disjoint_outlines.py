@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from shapely import MultiPolygon, Polygon
 from shapely.affinity import rotate
 
-from pipeline.roof.disjoint_outlines import Claim, _thinned, divided, effort, left_of
+from pipeline.roof.disjoint_outlines import Claim, _thinned, _without_needles, divided, effort, left_of
 
 CORNER_MM = np.array([84_900_000, 447_500_000])
 
@@ -158,6 +158,15 @@ def test_needles_and_small_parts_are_left_out() -> None:
     assert overlap_m2(outlines) == 0.0
     assert len(outlines[1].geoms) == 1
     assert corners(outlines[1]) == 4
+
+
+def test_a_needle_goes_though_a_cut_corner_would_make_up_for_its_area() -> None:
+    slope = np.tan(np.radians(15.0))
+    wedge = Polygon([(300, -300 * slope), (9000, -9000 * slope), (9000, 9000 * slope), (300, 300 * slope)])
+    with_needle = shapely.set_precision(wedge.union(shapely.box(8999, 0, 9250, 100)), 1.0)
+    (left,) = _without_needles(with_needle)
+    assert left.bounds[2] <= 9001.0
+    assert left.area == pytest.approx(wedge.area, abs=4000.0)
 
 
 @settings(max_examples=examples(60), deadline=None)

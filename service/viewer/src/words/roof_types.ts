@@ -3,7 +3,8 @@
  * was judged not to be a building.
  *
  * Colours are from the palette of Okabe and Ito (2008), distinguishable with every kind of colour blindness; rarer
- * types have shades of the type that they resemble, as in `pipeline/report/palette.py`; doubtful, fallback, failed and rejected are shown by hatching and outline, too.
+ * types have shades of the type that they resemble, as in `pipeline/report/palette.py`. Doubtful, fallback, failed and
+ * rejected are shown by hatching and outline, too.
  */
 export const CATEGORIES = {
   flat: { label: "Flat", colour: "#56b4e9" },
