@@ -44,7 +44,7 @@ from pipeline.runtime.run import RunSummary, run
 from pipeline.runtime.run_plan import Plan, make_plan, tiles_per_block
 from pipeline.runtime.scratch.outcomes import OutcomeTask, StoredOutcome
 from pipeline.runtime.stages import divided_units as units
-from pipeline.runtime.stages import join, stored_sites
+from pipeline.runtime.stages import join, stored_sites, touching
 from pipeline.runtime.stages.join import JoinBrief
 from pipeline.settings import RunSettings
 from pipeline.tiling import MM, Tile
@@ -119,14 +119,14 @@ class Copier(SerialExecutor):
     """Gives each task the brief of the one that it copies.
 
     `briefs` are those of the small city, whose first column of tiles is `first`; its copies lie `stride` columns apart.
-    A block of the ground is `block` tiles across.
+    A block of the ground is `block` tiles across; the stride is even.
     """
 
     def __init__(
         self, briefs: Mapping[tuple[str, ...], bytes], first: int, stride: int, copies: int, block: int
     ) -> None:
         self._briefs, self._first, self._stride, self._copies = briefs, first, stride, copies
-        self._across = {"ground": block, "join": _ACROSS}
+        self._across = {"ground": block, "join": _ACROSS, touching.STAGE: touching.ACROSS}
         self.before_s: dict[str, float] = {}
         """Processor time from the end of the stage before to the first task, by stage: nothing runs then."""
         self.during_s: dict[str, float] = {}

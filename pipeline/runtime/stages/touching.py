@@ -62,7 +62,7 @@ _LEAST_SEEN = 0.1
 """A slit is closed where it holds at least so much of the points that a roof as large would."""
 _MOST_GROUND, _GROUND_MM = 0.1, 1000
 """At most so many of them lie at the terrain, or less than this above it."""
-_ACROSS = 2
+ACROSS = 2
 """A task takes so many tiles across: along their borders everything is done twice."""
 _HELD = 16
 """Candidates whose points stay in memory from one overlap to the next."""
@@ -99,7 +99,7 @@ def drawn_apart(context: RunContext, roof: RoofSettings, joined: Joined) -> Join
     owned: dict[tuple[int, int], list[StoredGroup]] = collections.defaultdict(list)
     for group in joined.groups:
         owner = group.figures.owner
-        owned[owner.column // _ACROSS, owner.row // _ACROSS].append(group)
+        owned[owner.column // ACROSS, owner.row // ACROSS].append(group)
     blocks = sorted(owned)
     reach = [box_around(group.figures.reach_mm for group in owned[block]) for block in blocks]
     boxes = np.array([None if box is None else shapely.box(*box) for box in reach], object)
