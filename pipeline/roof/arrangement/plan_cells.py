@@ -38,7 +38,7 @@ _SMEARED_SHARE = 0.1
 """Share of a sliver's points that misfit its own plane from which on they are those of a wall, smeared by the beam: the
 points of a parapet's top fit it, those of a wall are spread over its height."""
 _LOW_SHARE = 0.5
-"""A neighbour's plane explains a sliver up to this misfit per point: such a rim is no higher than the roof."""
+"""A sliver joins its neighbour if the misfit per point is at most this: its points are as low as that roof."""
 
 
 @kernel

@@ -23,7 +23,7 @@ SHEDS = (((12.0, 12.0, 24.0, 20.0), 60.0), ((23.7, 13.0, 32.0, 19.0), 54.0), ((1
 """Boxes and elevations of flat roofs; two are seen beneath the eaves of a much higher one. None touches the fourth."""
 ALONE = ((48.0, 48.0, 58.0, 56.0), 57.0)
 NOTHING_M2 = 1e-7
-"""Coordinates in metres are rounded: a smaller area than this is no overlap."""
+"""Coordinates in metres are rounded, so a smaller area does not count."""
 TRUSTED = {"classes": "trust"}
 
 
