@@ -7,7 +7,8 @@ dormers) belong to one unit; patches with a step between them do not. A part tha
 
 - a step along the contour lines of the roof, as in offset pent roofs and saw-tooth halls, lies within a house: party
   walls run up the slope;
-- a valley between two parallel ridges is the gutter between two houses.
+- a valley between two parallel ridges is the gutter between two houses, but not between alike teeth of a saw-tooth
+  hall, whose backs are steep.
 
 Patches of one curved surface (`terrain.curved_surfaces`) are one unit, whatever the folds between them.
 
@@ -18,6 +19,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -57,6 +59,8 @@ _ALONG = 0.5
 """Sine of 30 deg: a border closer than this to a contour line runs along it."""
 _OPPOSITE = -0.87
 """Cosine of 150 deg: slopes that face each other."""
+_TOOTH = 2.5
+"""The back of a tooth rises by this factor more than its slope; the two sides of a gable differ by less."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,9 +95,23 @@ def _facing(patches: Patches, borders: Borders, row: int) -> _Facing | None:
     rise_p, rise_q = (ax * nx + ay * ny) / steep_p, (bx * nx + by * ny) / steep_q
     along = abs(ax * dx + ay * dy) <= _ALONG * steep_p and abs(bx * dx + by * dy) <= _ALONG * steep_q
     opposite = (ax * bx + ay * by) / (steep_p * steep_q) <= _OPPOSITE
-    between = (1.0 + ax * bx + ay * by) / math.sqrt((1.0 + steep_p**2) * (1.0 + steep_q**2))
     ridge, valley = along and rise_p > 0.0 > rise_q, along and rise_p < 0.0 < rise_q
-    return _Facing(along, opposite, ridge, valley, between >= MIN_COSINE)
+    return _Facing(along, opposite, ridge, valley, _are_alike(patches, p, q))
+
+
+def _are_alike(patches: Patches, p: int, q: int) -> bool:
+    """Whether two patches slope in one direction, about as steeply."""
+    (ax, ay), (bx, by) = patches.slopes[p].tolist(), patches.slopes[q].tolist()
+    lengths = math.sqrt((1.0 + ax * ax + ay * ay) * (1.0 + bx * bx + by * by))
+    return (1.0 + ax * bx + ay * by) / lengths >= MIN_COSINE
+
+
+def _are_teeth(patches: Patches, p: int, q: int, across: Mapping[int, set[int]]) -> bool:
+    """Whether two patches that fall to one valley are of two alike teeth; `across` are those over ridges of each."""
+    steep = np.hypot(*patches.slopes[[p, q]].T)
+    return bool(steep.max() >= _TOOTH * steep.min()) and all(
+        any(_are_alike(patches, other, end) for other in across[start]) for start, end in ((p, q), (q, p))
+    )
 
 
 def _clear_borders(patches: Patches, borders: Borders) -> dict[int, _Facing | None]:
@@ -126,10 +144,12 @@ def units_of_patches(
     count = len(patches.areas_m2)
     unit = np.where(curve >= 0, curve, np.arange(count))
     facing = _clear_borders(patches, borders)
-    has_ridge = set()
+    across: dict[int, set[int]] = {}
     for row, seen in facing.items():
         if seen is not None and seen.ridge and seen.opposite:
-            has_ridge |= {int(borders.first[row]), int(borders.second[row])}
+            p, q = int(borders.first[row]), int(borders.second[row])
+            across.setdefault(p, set()).add(q)
+            across.setdefault(q, set()).add(p)
     apart: dict[int, set[int]] = {k: set() for k in set(unit.tolist())}
     joining = []
     for row, seen in facing.items():
@@ -141,9 +161,10 @@ def units_of_patches(
             and seen is not None
             and seen.valley
             and seen.opposite
-            and p in has_ridge
-            and q in has_ridge
+            and p in across
+            and q in across
             and borders.extent_m[row] >= _SHORTEST_VALLEY_M
+            and not _are_teeth(patches, p, q, across)
         )
         if is_gutter or (roof[p] == roof[q] and house[p] != house[q]):
             apart[int(unit[p])].add(int(unit[q]))
