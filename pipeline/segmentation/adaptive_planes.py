@@ -56,6 +56,8 @@ _VOTING_PASSES = 3
 """Passes of voting; labels hardly change later."""
 _PLANE_COST = 5.0
 """Points that would be unexplained without a plane for it to stay."""
+_ROW_SPACINGS, _ROW_M = 1.5, 0.6
+"""Extent of one row of points: where they are sparse, the slopes of houses are no wider than a few rows."""
 _ROUNDS = 2
 """Rounds of regression, merging and assignment: labels hardly change later."""
 _MAD_TO_SIGMA = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
@@ -84,11 +86,12 @@ def detect_planes(points: FloatArray, spacing_m: float, settings: AdaptivePlaneS
     points = np.ascontiguousarray(points, dtype=np.float64)
     if len(points) < MIN_PLANE_POINTS or not spacing_m > 0.0:
         return DetectedPlanes(coefficients=np.zeros((0, 3)), labels=np.full(len(points), -1, np.int32))
+    row_m = min(_ROW_SPACINGS * spacing_m, _ROW_M)
     if spacing_m < _DENSE_SPACING_M:
         from pipeline.segmentation.mean_nodes import mean_nodes
 
         nodes, node_of = mean_nodes(points, _NODE_CELL_M, settings.max_distance_m)
-        spacing_m = _NODE_CELL_M
+        spacing_m, row_m = _NODE_CELL_M, 0.0  # one row of nodes may be a slope
     else:
         nodes, node_of = points, np.arange(len(points), dtype=np.int32)
     limits = _Limits(
@@ -98,6 +101,7 @@ def detect_planes(points: FloatArray, spacing_m: float, settings: AdaptivePlaneS
         fewest_points=settings.fewest_points(spacing_m),
         min_cosine=math.cos(math.radians(settings.max_slope_deg)),
         normal_cosine=math.cos(math.radians(settings.normal_angle_deg)),
+        row_m=row_m,
     )
     neighbours = nearest_neighbours(nodes, _NEIGHBOURS)
     coefficients, labels = _detect(points, nodes, node_of, neighbours, spacing_m, limits)
@@ -115,6 +119,8 @@ class _Limits(NamedTuple):
     """Least cosine of a plane's slope."""
     normal_cosine: float
     """Least cosine between a plane and a point's own."""
+    row_m: float
+    """Extent in plan up to which points are one row."""
 
 
 @kernel
@@ -207,6 +213,7 @@ def _settled(
     sigma_m: float,
     fewest_points: int,
     min_cosine: float,
+    row_m: float,
 ) -> LabelArray:
     """Labels after rounds of regression, merging and assignment."""
     for _ in range(_ROUNDS):
@@ -216,7 +223,7 @@ def _settled(
             if labels[i] >= 0:
                 labels[i] = root[labels[i]] if usable[labels[i]] else -1
         planes, usable, _ = _fitted(points, labels, count, fewest_points, min_cosine)
-        dissolve_redundant(points, neighbours, labels, planes, usable, distance_m, _PLANE_COST)
+        dissolve_redundant(points, neighbours, labels, planes, usable, distance_m, _PLANE_COST, row_m)
         labels = vote_among_neighbours(
             points, neighbours, labels, planes, usable, distance_m, _VOTE_WEIGHT, _VOTING_PASSES
         )
@@ -311,7 +318,7 @@ def _detect(
     limits: _Limits,
 ) -> tuple[FloatArray, LabelArray]:
     """Kernel of `detect_planes`: planes, labels of the points."""
-    noises, min_distance_m, max_distance_m, fewest_points, min_cosine, normal_cosine = limits
+    noises, min_distance_m, max_distance_m, fewest_points, min_cosine, normal_cosine, row_m = limits
     surroundings = local_planes(nodes, neighbours)
     sigma_m = noise_of_local_planes(surroundings.variances, surroundings.order)
     distance_m = min(max(noises * sigma_m, min_distance_m), max_distance_m)
@@ -328,7 +335,7 @@ def _detect(
         trial_limits = TrialLimits(reach_m, min_normal_cosine, fewest_points, min_cosine)
         count = take_regions(surroundings, labels, before, trial_limits)
         if count > before:
-            labels = _settled(nodes, neighbours, labels, count, distance_m, sigma_m, fewest_points, min_cosine)
+            labels = _settled(nodes, neighbours, labels, count, distance_m, sigma_m, fewest_points, min_cosine, row_m)
     planes, usable, _ = _fitted(nodes, labels, count, fewest_points, min_cosine)
     for i in range(labels.size):
         if labels[i] >= 0 and not usable[labels[i]]:

@@ -165,14 +165,14 @@ def _refine(
             labels = nearest_plane(points, planes, usable, rules.distance_m)
         else:
             if round_ > 0:
-                dissolve_redundant(points, neighbours, labels, planes, usable, rules.distance_m, rules.plane_cost)
+                dissolve_redundant(points, neighbours, labels, planes, usable, rules.distance_m, rules.plane_cost, 0.0)
             labels = vote_among_neighbours(
                 points, neighbours, labels, planes, usable, rules.distance_m, rules.vote_weight, rules.voting_passes
             )
     sums = cluster_sums(points, labels, n_clusters)
     _fit_all(sums, planes, usable, rules.fewest_points, rules.min_cosine)
     if not rules.all_planes:
-        dissolve_redundant(points, neighbours, labels, planes, usable, rules.distance_m, rules.plane_cost)
+        dissolve_redundant(points, neighbours, labels, planes, usable, rules.distance_m, rules.plane_cost, 0.0)
         labels = vote_among_neighbours(
             points, neighbours, labels, planes, usable, rules.distance_m, rules.vote_weight, rules.voting_passes
         )

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.kernels.sorting import ascending_order, counting_sort, in_order
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
 from pipeline.segmentation.plane_regression import cosine_of_slope
+
+_LEVEL = math.tan(math.radians(10.0))
+"""Rise over run of a slope."""
+_STEP = 2.0
+"""Largest distances of a point to its plane that make a step."""
 
 
 @kernel
@@ -219,12 +226,15 @@ def dissolve_redundant(
     usable: BoolArray,
     distance_m: float,
     plane_cost: float,
+    row_m: float,
 ) -> None:
     """Give up planes whose points the planes around explain nearly as well, the smallest first, in place.
 
     The noise of a large plane leaves clusters of its outliers, and the edge between two planes a plane across it. The
     worth of a plane is the sum over its points of (distance / limit)^2 to the nearest touching plane, at most 1, less
-    the same to itself. Points of a plane that is given up take the nearest touching plane, or none.
+    the same to itself. A slope is worth nothing, either, if all that is left to it is one row of points along a contour
+    line, as of a parapet: with points below the step any row makes a plane. Points of a plane that is given up take the
+    nearest touching plane, or none.
 
     Parameters
     ----------
@@ -242,6 +252,8 @@ def dissolve_redundant(
         Largest perpendicular distance of a point to its plane.
     plane_cost : float
         Least worth of a plane; 0 gives up none.
+    row_m : float
+        Extent in plan up to which points are one row.
     """
     n = usable.size
     pairs = touching_pairs(neighbours, labels, usable)
@@ -255,18 +267,25 @@ def dissolve_redundant(
     for k in ascending_order(size):
         if not usable[k] or first[k] == first[k + 1]:
             continue
-        worth = 0.0
+        worth, low, high, off, own_points = 0.0, np.inf, -np.inf, 0.0, 0
+        a, b = planes[k, 0], planes[k, 1]
+        steep = math.sqrt(a * a + b * b)
         for m in range(begin[k], begin[k + 1]):
             i = member[m]
-            least = distance_m
+            away = np.inf
             for p in range(first[k], first[k + 1]):
                 if usable[partner[p]]:
-                    least = min(least, distance_to_plane(points, i, planes, partner[p]))
+                    away = min(away, distance_to_plane(points, i, planes, partner[p]))
+            least = min(away, distance_m)
             own = min(distance_m, distance_to_plane(points, i, planes, k))
             worth += (least * least - own * own) / (distance_m * distance_m)
-            if worth > 4.0 * plane_cost:
+            if least == distance_m:
+                rise = a * points[i, 0] + b * points[i, 1]
+                low, high, off, own_points = min(low, rise), max(high, rise), off + away, own_points + 1
+            if worth > 4.0 * plane_cost and high - low >= row_m * steep:
                 break
-        if worth >= plane_cost:
+        is_row = own_points > 0 and steep > _LEVEL and high - low < row_m * steep
+        if worth >= plane_cost and not (is_row and off >= _STEP * distance_m * own_points):
             continue
         usable[k] = False
         for m in range(begin[k], begin[k + 1]):
