@@ -160,6 +160,13 @@ def test_a_step_parts_two_level_roofs_and_without_it_they_are_one(
     assert len(found.coefficients) == planes
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_the_kicked_eaves_of_a_steep_roof_are_a_slope(seed: int) -> None:
+    points = strewn(6.0, seed)
+    points[:, 2] = 9.0 + np.maximum(0.7 * points[:, 1], 1.1 * points[:, 1] - 0.48)
+    assert len(detected(canonical(points)).coefficients) == 2
+
+
 def test_a_gentle_ridge_is_no_bridge() -> None:
     found = detected(gable(6.0, 0.05, rise=0.12))
     assert len(found.coefficients) == 2

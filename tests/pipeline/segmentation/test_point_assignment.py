@@ -93,7 +93,7 @@ def test_redundant_planes_are_those_a_loop_gives_up(seed: int) -> None:
                 best = min(near, key=lambda p, n=near: n[p], default=-1)
                 relabelled[i] = best if best >= 0 and near[best] < 0.2 else -1
     # A point that went to a plane which is given up later is judged by its first label: compare what stays in use.
-    dissolve_redundant(points, neighbours, labels, planes, usable, 0.2, 8.0)
+    dissolve_redundant(points, neighbours, labels, planes, usable, 0.2, 8.0, 0.0)
     assert usable.tolist() == expected.tolist()
     assert labels.tolist() == relabelled.tolist()
 
@@ -101,5 +101,20 @@ def test_redundant_planes_are_those_a_loop_gives_up(seed: int) -> None:
 def test_a_cost_of_zero_gives_up_nothing() -> None:
     points, neighbours, planes, usable, labels = scene(0)
     before = usable.copy()
-    dissolve_redundant(points, neighbours, labels, planes, usable, 0.2, 0.0)
+    dissolve_redundant(points, neighbours, labels, planes, usable, 0.2, 0.0, 0.0)
     assert usable.tolist() == before.tolist()
+
+
+@pytest.mark.parametrize(("width_m", "stays"), [(0.3, False), (1.4, True)])
+def test_a_slope_between_two_levels_needs_more_than_a_row_of_points(width_m: float, stays: bool) -> None:
+    """Rows of points every 0.35 m: a level roof at 9 m, then a slope that rises by 0.8 m over some width."""
+    x, y = (values.ravel() for values in np.meshgrid(np.arange(0.0, 10.0, 0.35), np.arange(-5.0, width_m + 0.01, 0.35)))
+    y = y - y.max() + width_m
+    points = np.column_stack([x, y, 9.0 + 0.8 / width_m * np.maximum(y, 0.0)])
+    planes = np.array([[0.0, 0.0, 9.0], [0.0, 0.8 / width_m, 9.0]])
+    labels = (y > -0.1).astype(np.int32)
+    usable = np.ones(2, np.bool_)
+    dissolve_redundant(points, nearest_neighbours(points, 8), labels, planes, usable, 0.15, 5.0, 0.5)
+    assert usable.tolist() == [True, stays]
+    top = np.abs(y - width_m) < 0.1
+    assert (labels[top] == (1 if stays else -1)).all()

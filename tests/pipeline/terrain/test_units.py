@@ -104,6 +104,18 @@ def _saw_tooth(x: FloatArray, y: FloatArray) -> tuple[FloatArray, IntArray]:
     return 6.0 + SHALLOW * (x % 4), np.where(_inside(x, y, 0, 0, 20, 18), 0, -1)
 
 
+def _steep_backs(x: FloatArray, y: FloatArray) -> tuple[FloatArray, IntArray]:
+    """Four teeth with backs of 65 degrees, which meet the next slope in a valley."""
+    tooth, rise, back = x % 6, math.tan(math.radians(22.0)), math.tan(math.radians(65.0))
+    return 6.0 + np.minimum(rise * tooth, back * (6 - tooth)), np.where(_inside(x, y, 0, 0, 24, 14), 0, -1)
+
+
+def _steep_beside_gentle(x: FloatArray, y: FloatArray) -> tuple[FloatArray, IntArray]:
+    """A house of 60 degrees and one of 20 degrees side by side with a gutter between them."""
+    house = np.where(_inside(x, y, 0, 0, 16, 14), x >= 7, -1).astype(np.int64)
+    return np.where(house == 0, _gable(x, 7, 6.0, 1.73), _gable(x - 7, 9, 6.0, 0.36)), house
+
+
 def _offset_pents(x: FloatArray, y: FloatArray) -> tuple[FloatArray, IntArray]:
     """One house under two pent roofs with a wall of 1 m between their tops."""
     z = np.where(y < 6, 5.0 + SHALLOW * y, 4.0 + SHALLOW * (12 - y))
@@ -184,6 +196,7 @@ SEPARATED = {
     "a row with small steps of the ridge": _row((6.0, 6.15, 6.0, 6.18)),
     "a row with steps of the ridge as large as what a patch takes": _row((6.0, 6.2, 5.97, 6.19)),
     "a mansard row": _mansard_row,
+    "a steep house beside a gentle one": _steep_beside_gentle,
     "the corner of a block": _corner_of_a_block,
     "a flat house between gables": _flat_between_gables,
     "parallel gables": _parallel_gables,
@@ -198,6 +211,7 @@ TOGETHER = {
     "a steep hip": _steep_hip,
     "a hip at a corner": _hip_corner,
     "a saw-tooth hall": _saw_tooth,
+    "a saw-tooth hall with sloping backs": _steep_backs,
     "offset pent roofs": _offset_pents,
     "a tower on a hall": _tower_on_hall,
     "a dormer": _dormer,
