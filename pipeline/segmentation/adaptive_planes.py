@@ -211,11 +211,10 @@ def _settled(
     count: int,
     distance_m: float,
     sigma_m: float,
-    fewest_points: int,
-    min_cosine: float,
-    row_m: float,
+    limits: _Limits,
 ) -> LabelArray:
     """Labels after rounds of regression, merging and assignment."""
+    fewest_points, min_cosine = limits.fewest_points, limits.min_cosine
     for _ in range(_ROUNDS):
         _, usable, sums = _fitted(points, labels, count, fewest_points, min_cosine)
         root = merge_by_f_test(sums, touching_pairs(neighbours, labels, usable), sigma_m)
@@ -223,7 +222,7 @@ def _settled(
             if labels[i] >= 0:
                 labels[i] = root[labels[i]] if usable[labels[i]] else -1
         planes, usable, _ = _fitted(points, labels, count, fewest_points, min_cosine)
-        dissolve_redundant(points, neighbours, labels, planes, usable, distance_m, _PLANE_COST, row_m)
+        dissolve_redundant(points, neighbours, labels, planes, usable, distance_m, _PLANE_COST, limits.row_m)
         labels = vote_among_neighbours(
             points, neighbours, labels, planes, usable, distance_m, _VOTE_WEIGHT, _VOTING_PASSES
         )
@@ -318,7 +317,7 @@ def _detect(
     limits: _Limits,
 ) -> tuple[FloatArray, LabelArray]:
     """Kernel of `detect_planes`: planes, labels of the points."""
-    noises, min_distance_m, max_distance_m, fewest_points, min_cosine, normal_cosine, row_m = limits
+    noises, min_distance_m, max_distance_m, fewest_points, min_cosine, normal_cosine, _ = limits
     surroundings = local_planes(nodes, neighbours)
     sigma_m = noise_of_local_planes(surroundings.variances, surroundings.order)
     distance_m = min(max(noises * sigma_m, min_distance_m), max_distance_m)
@@ -335,7 +334,7 @@ def _detect(
         trial_limits = TrialLimits(reach_m, min_normal_cosine, fewest_points, min_cosine)
         count = take_regions(surroundings, labels, before, trial_limits)
         if count > before:
-            labels = _settled(nodes, neighbours, labels, count, distance_m, sigma_m, fewest_points, min_cosine, row_m)
+            labels = _settled(nodes, neighbours, labels, count, distance_m, sigma_m, limits)
     planes, usable, _ = _fitted(nodes, labels, count, fewest_points, min_cosine)
     for i in range(labels.size):
         if labels[i] >= 0 and not usable[labels[i]]:
