@@ -19,12 +19,10 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
 
 import numpy as np
 
 from pipeline.compiler import kernel
-from pipeline.kernels.union_find import root_of, unite, united
 from pipeline.model import FloatArray, IntArray, LabelArray
 from pipeline.terrain.ridge_steps import Rows, cut_at_ridge_steps
 from pipeline.terrain.roof_patches import (
@@ -59,8 +57,6 @@ _ALONG = 0.5
 """Sine of 30 deg: a border closer than this to a contour line runs along it."""
 _OPPOSITE = -0.87
 """Cosine of 150 deg: slopes that face each other."""
-_TOOTH = 2.5
-"""The back of a tooth rises by this factor more than its slope; the two sides of a gable differ by less."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,22 +92,8 @@ def _facing(patches: Patches, borders: Borders, row: int) -> _Facing | None:
     along = abs(ax * dx + ay * dy) <= _ALONG * steep_p and abs(bx * dx + by * dy) <= _ALONG * steep_q
     opposite = (ax * bx + ay * by) / (steep_p * steep_q) <= _OPPOSITE
     ridge, valley = along and rise_p > 0.0 > rise_q, along and rise_p < 0.0 < rise_q
-    return _Facing(along, opposite, ridge, valley, _are_alike(patches, p, q))
-
-
-def _are_alike(patches: Patches, p: int, q: int) -> bool:
-    """Whether two patches slope in one direction, about as steeply."""
-    (ax, ay), (bx, by) = patches.slopes[p].tolist(), patches.slopes[q].tolist()
-    lengths = math.sqrt((1.0 + ax * ax + ay * ay) * (1.0 + bx * bx + by * by))
-    return (1.0 + ax * bx + ay * by) / lengths >= MIN_COSINE
-
-
-def _are_teeth(patches: Patches, p: int, q: int, across: Mapping[int, set[int]]) -> bool:
-    """Whether two patches that fall to one valley are of two alike teeth; `across` are those over ridges of each."""
-    steep = np.hypot(*patches.slopes[[p, q]].T)
-    return bool(steep.max() >= _TOOTH * steep.min()) and all(
-        any(_are_alike(patches, other, end) for other in across[start]) for start, end in ((p, q), (q, p))
-    )
+    between = (1.0 + ax * bx + ay * by) / math.sqrt((1.0 + steep_p**2) * (1.0 + steep_q**2))
+    return _Facing(along, opposite, ridge, valley, between >= MIN_COSINE)
 
 
 def _clear_borders(patches: Patches, borders: Borders) -> dict[int, _Facing | None]:
@@ -164,8 +146,11 @@ def units_of_patches(
             and p in across
             and q in across
             and borders.extent_m[row] >= _SHORTEST_VALLEY_M
-            and not _are_teeth(patches, p, q, across)
         )
+        if is_gutter:
+            from pipeline.terrain.saw_teeth import are_teeth  # few candidates have a gutter
+
+            is_gutter = not are_teeth(patches, p, q, across)
         if is_gutter or (roof[p] == roof[q] and house[p] != house[q]):
             apart[int(unit[p])].add(int(unit[q]))
             apart[int(unit[q])].add(int(unit[p]))
@@ -181,83 +166,11 @@ def units_of_patches(
         for other in apart.pop(q):
             apart[other].discard(q)
             apart[other].add(p)
-    return _absorbed(unit, patches, borders, settings)
+    if (unit == unit[0]).all():
+        return unit.astype(np.int32)
+    from pipeline.terrain.absorbed_parts import absorbed  # most candidates are one building
 
-
-def _absorbed(unit: IntArray, patches: Patches, borders: Borders, settings: UnitSettings) -> LabelArray:
-    """Join to its neighbour what is too small, enclosed by one other unit, or its annex; the smallest first."""
-    beside: dict[int, dict[int, float]] = {int(k): {} for k in unit}
-    area = dict.fromkeys(beside, 0.0)
-    outline = dict.fromkeys(beside, 0.0)
-    volume = dict.fromkeys(beside, 0.0)  # area times elevation
-    top = dict.fromkeys(beside, -math.inf)
-    for k, own in enumerate(unit.tolist()):
-        area[own] += float(patches.areas_m2[k])
-        outline[own] += float(patches.outlines_m[k])
-        volume[own] += float(patches.areas_m2[k] * patches.centres_m[k, 2])
-        top[own] = max(top[own], float(patches.tops_m[k]))
-    for p, q, length in zip(borders.first.tolist(), borders.second.tolist(), borders.length_m.tolist(), strict=True):
-        a, b = int(unit[p]), int(unit[q])
-        if a == b:
-            outline[a] -= 2.0 * length
-        else:
-            beside[a][b] = beside[a].get(b, 0.0) + length
-            beside[b][a] = beside[b].get(a, 0.0) + length
-    into = {k: k for k in beside}
-    waiting = sorted(beside, key=lambda k: (area[k], k))
-    while waiting:
-        again = []
-        for k in waiting:
-            if into[k] != k or not beside[k]:
-                continue
-            other = max(beside[k], key=lambda o: (beside[k][o], -o))
-            enclosed = beside[k][other] >= settings.enclosed_share * outline[k] and area[k] < area[other]
-            annex = (
-                len(beside[k]) == 1
-                and area[k] < settings.annex_share * area[other]
-                and top[k] * area[other] < volume[other]
-            )
-            if area[k] >= settings.min_area_m2 and not enclosed and not annex:
-                continue
-            into[k] = other
-            area[other] += area[k]
-            volume[other] += volume[k]
-            top[other] = max(top[other], top[k])
-            outline[other] += outline[k] - 2.0 * beside[k][other]
-            for o, length in beside[k].items():
-                del beside[o][k]
-                if o != other:
-                    beside[other][o] = beside[other].get(o, 0.0) + length
-                    beside[o][other] = beside[o].get(other, 0.0) + length
-            again.append(other)
-        # what has grown, and all beside it, may have become enclosed or enclosing
-        touched = {t for k in again if into[k] == k for t in (k, *beside[k])}
-        waiting = sorted(touched, key=lambda k: (area[k], k))
-
-    def last(k: int) -> int:
-        while into[k] != k:
-            k = into[k]
-        return k
-
-    return _across_gaps(np.array([last(k) for k in unit.tolist()], np.int32), borders)
-
-
-def _across_gaps(unit: LabelArray, borders: Borders) -> LabelArray:
-    """Join parts that are connected only across gaps in the data: a gap does not separate buildings."""
-    part = united(len(unit), borders.first, borders.second)
-    return _united_across(part, unit.astype(np.int64), borders.gap_pairs.astype(np.int64))
-
-
-@kernel
-def _united_across(part: IntArray, whole: IntArray, gap_pairs: IntArray) -> LabelArray:
-    """The sets `whole`, each as one of its members, after uniting the pairs (g, 2) that unite sets in `part`, too."""
-    for g in range(len(gap_pairs)):
-        if unite(part, gap_pairs[g, 0], gap_pairs[g, 1]):
-            unite(whole, gap_pairs[g, 0], gap_pairs[g, 1])
-    roots = np.empty(len(whole), np.int32)
-    for k in range(len(whole)):
-        roots[k] = root_of(whole, k)
-    return roots
+    return absorbed(unit, patches, borders, settings)
 
 
 @kernel
