@@ -64,13 +64,15 @@ def own_model(building: Building, segmentation: Segmentation, roof: RoofPoints, 
         drawn, roof = drawn.partition, dataclasses.replace(roof, labels=drawn.labels)
     elif drawn.planes is not None:
         planes = drawn.planes
-    if segmentation.faces is not None:  # a primitive is one form: with a side made level it would be another
+    known = segmentation.roof_type or drawn.roof_type
+    if segmentation.faces is not None or drawn.roof_type is not None:
+        # a primitive or a curve is one form: with a side made level it would be another
         parts = large_parts(solid_parts(drawn, list(planes), ground_z_m, roof.limit_mm), settings.min_part_area_m2)
         return DrawnModel(
             lod="2.2",
             parts=[extra("unite_flush_walls")(part, roof.limit_mm) for part in parts],
             planes=list(planes),
-            roof_type=segmentation.roof_type,
+            roof_type=known,
             bic_margin=margin,
         )
 
@@ -88,7 +90,7 @@ def own_model(building: Building, segmentation: Segmentation, roof: RoofPoints, 
             lod="2.2",
             parts=parts,
             planes=cut_planes,
-            roof_type=segmentation.roof_type,
+            roof_type=known,
             bic_margin=margin,
             is_levelled=is_far or levelled_share > _MUCH_LEVELLED or contradiction is not None,
             levelled_share=levelled_share,

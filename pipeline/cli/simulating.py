@@ -19,7 +19,7 @@ def simulate(
         typer.Argument(
             metavar="SUITE",
             help="suburb, town, cube, hofmann310, sweep, city, low_buildings, bridges_and_vans, wide_halls, "
-            "outline_shapes, broken_slopes, trust or one of the roof shapes.",
+            "outline_shapes, broken_slopes, curved_roofs, trust or one of the roof shapes.",
         ),
     ],
     out: Annotated[str, typer.Option(metavar="DIR", help="The folder to write: LAZ tiles and the truth beside them.")],

@@ -13,7 +13,7 @@ import shapely
 from shapely import MultiPolygon
 
 from pipeline.errors import BuildingError
-from pipeline.model import Decision, DecisionKind, Outcome, Plane
+from pipeline.model import Decision, DecisionKind, LabelArray, Outcome, Plane
 from pipeline.registry import extra
 from pipeline.roof.named_form import ARRANGEMENT, MOST_TEMPLATE_POINTS, SIMPLER, TEMPLATES, NamedForm, RankedFaces
 from pipeline.roof.partition import RoofPartition
@@ -50,6 +50,10 @@ def arranged_forms(
     elif roof.guides:
         with extra("guide_steps")():
             outline_mm = extra("guided_outline")(outline_mm, roof.guides, roof.xy_mm, roof.guide_distance_m)
+    if may_be_curved(roof.labels, planes):
+        from pipeline.roof.curved.curved_form import curved_forms
+
+        yield from curved_forms(roof, planes, outline_mm, decisions)
     first, last = _competing_forms(roof, planes, outline_mm, settings, costs, decisions)
     yield from first
     # many planes that meet nearly in one point: with more room between its vertices the solid is valid
@@ -71,6 +75,10 @@ def arranged_forms(
 
         yield from traced_forms(plan, roof, settings)
     yield from last
+
+
+def may_be_curved(labels: LabelArray, planes: Sequence[Plane]) -> bool:
+    return len(planes) >= 3
 
 
 def template_forms(roof: RoofPoints, lack: BuildingError, settings: RoofSettings) -> Iterator[FaceForm]:

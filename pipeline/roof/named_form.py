@@ -13,7 +13,8 @@ from pipeline.roof.partition import RoofPartition
 Drawn_co = TypeVar("Drawn_co", covariant=True)
 
 ARRANGEMENT, TEMPLATES, TRACED, PRIMITIVE, BLOCK = "arrangement", "templates", "traced", "primitive", "block"
-"""Faces of least cost, simple shapes, traced borders, a whole form of a method, one level block."""
+CURVED = "curved"
+"""Faces of least cost, simple shapes, traced borders, a whole form of a method, one level block, facets of a curve."""
 
 SIMPLER = "within a simpler outline"
 """Detail of a form."""

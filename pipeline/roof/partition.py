@@ -19,7 +19,7 @@ from pipeline.compiler import kernel
 from pipeline.errors import BuildingError
 from pipeline.kernels.sorting import ascending_order, counting_sort
 from pipeline.kernels.union_find import numbered_sets, unite
-from pipeline.model import FloatArray, IntArray, LabelArray, Plane, Reason, Tin
+from pipeline.model import FloatArray, IntArray, LabelArray, Plane, Reason, RoofType, Tin
 from pipeline.prepared_cloud import SHADING_HEIGHT_M
 
 OUTSIDE = -1
@@ -48,6 +48,8 @@ class RoofPartition:
     """(p,) int32, the plane of each polygon."""
     planes: tuple[Plane, ...] | None = None
     """The planes that the labels number; None for those of the segmentation."""
+    roof_type: RoofType | None = None
+    """That of a curved surface, whose facets stay as they are; None for the rule over the planes."""
 
 
 class MinAreas(NamedTuple):

@@ -9,7 +9,7 @@ import numpy as np
 
 from pipeline.model import FloatArray
 from pipeline.ruler.simulation.envelope import RoofPart, envelope
-from pipeline.ruler.simulation.roofs import ROOFS, BrokenForm, RoofDimensions, RoofFaces, RoofShape
+from pipeline.ruler.simulation.roofs import ROOFS, BrokenForm, CurvedForm, RoofDimensions, RoofFaces, RoofShape
 from pipeline.ruler.simulation.simulated_scene import Building, Terrain, face_plane, place_building, turned
 
 
@@ -58,7 +58,7 @@ class PlannedRoof:
     """A building with a roof of its own making before it has a place."""
 
     name: str
-    shape: RoofShape | BrokenForm
+    shape: RoofShape | BrokenForm | CurvedForm
     roof: RoofFaces
     """About the middle of its box."""
     box: PlannedBuilding
@@ -73,7 +73,7 @@ class PlannedRoof:
         azimuth_deg: float,
         eave_height_m: float,
         margin_m: float,
-        shape: RoofShape | BrokenForm = RoofShape.FLAT,
+        shape: RoofShape | BrokenForm | CurvedForm = RoofShape.FLAT,
     ) -> PlannedRoof:
         """The envelope of convex parts in any frame."""
         roof = envelope(parts)

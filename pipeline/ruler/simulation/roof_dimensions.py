@@ -56,6 +56,19 @@ class BrokenForm(StrEnum):
     PARAPET_GABLE = "parapet_gable"
 
 
+class CurvedForm(StrEnum):
+    """The forms of the suite `curved_roofs`, which have functions of their own there."""
+
+    SHALLOW_BARREL = "shallow_barrel"
+    BARREL = "barrel"
+    HALF_BARREL = "half_barrel"
+    ELLIPTIC_BARREL = "elliptic_barrel"
+    CONE = "cone"
+    DOME = "dome"
+    CAP = "cap"
+    SQUARE_CAP = "square_cap"
+
+
 class AdditionKind(StrEnum):
     """A kind of addition to a roof."""
 

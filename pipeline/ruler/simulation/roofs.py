@@ -12,6 +12,7 @@ from pipeline.ruler.simulation.roof_dimensions import (
     Addition,
     AdditionKind,
     BrokenForm,
+    CurvedForm,
     FaceRings,
     FlatPart,
     RoofDimensions,
@@ -27,6 +28,7 @@ __all__ = [
     "Addition",
     "AdditionKind",
     "BrokenForm",
+    "CurvedForm",
     "FaceRings",
     "FlatPart",
     "RoofDimensions",
@@ -34,7 +36,7 @@ __all__ = [
     "RoofShape",
 ]
 
-ROOF_TYPES: dict[RoofShape | BrokenForm, RoofType] = {
+ROOF_TYPES: dict[RoofShape | BrokenForm | CurvedForm, RoofType] = {
     RoofShape.FLAT: RoofType.FLAT,
     RoofShape.PENT: RoofType.PENT,
     RoofShape.GABLE: RoofType.GABLE,
@@ -65,6 +67,14 @@ ROOF_TYPES: dict[RoofShape | BrokenForm, RoofType] = {
     BrokenForm.HIPPED_DORMERS: RoofType.GABLE,
     BrokenForm.PARAPET: RoofType.FLAT,
     BrokenForm.PARAPET_GABLE: RoofType.GABLE,
+    CurvedForm.SHALLOW_BARREL: RoofType.BARREL,
+    CurvedForm.BARREL: RoofType.BARREL,
+    CurvedForm.HALF_BARREL: RoofType.BARREL,
+    CurvedForm.ELLIPTIC_BARREL: RoofType.BARREL,
+    CurvedForm.CONE: RoofType.CONE,
+    CurvedForm.DOME: RoofType.DOME,
+    CurvedForm.CAP: RoofType.DOME,
+    CurvedForm.SQUARE_CAP: RoofType.DOME,
 }
 """The roof type of every shape in the records, with any additions."""
 

@@ -13,7 +13,7 @@ import numpy as np
 import shapely
 
 from pipeline.model import FloatArray, Plane, RoofType
-from pipeline.ruler.simulation.roofs import ROOF_TYPES, ROOFS, BrokenForm, FaceRings, RoofDimensions, RoofShape
+from pipeline.ruler.simulation.roofs import ROOF_TYPES, ROOFS, BrokenForm, CurvedForm, FaceRings, RoofDimensions, RoofShape
 
 _STEP_M = 0.05
 """Step of the central differences of the terrain."""
@@ -109,7 +109,7 @@ class Building:
     """Name, unique within the scene."""
     block_id: str
     """Buildings that touch share a block; else the building's own id."""
-    shape: RoofShape | BrokenForm
+    shape: RoofShape | BrokenForm | CurvedForm
     """The parametric shape."""
     dimensions: RoofDimensions
     """Its size."""

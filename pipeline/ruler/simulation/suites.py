@@ -13,6 +13,8 @@ from pipeline.ruler.simulation.bridges_and_vans import SCANNER as STREET_SCANNER
 from pipeline.ruler.simulation.bridges_and_vans import bridges_and_vans
 from pipeline.ruler.simulation.broken_slopes import CELLS as SLOPE_CELLS
 from pipeline.ruler.simulation.broken_slopes import broken_slopes
+from pipeline.ruler.simulation.curved_roofs import CELLS as CURVED_CELLS
+from pipeline.ruler.simulation.curved_roofs import curved_roofs
 from pipeline.ruler.simulation.city import CITY_SCANNER, TILE_M, CityPlan, Extent, city, hillside
 from pipeline.ruler.simulation.hofmann310 import SCANNER as HOFMANN_SCANNER
 from pipeline.ruler.simulation.hofmann310 import hofmann310
@@ -271,6 +273,15 @@ SUITES: dict[str, Suite] = {
             size_m=(150.0, 350.0),
             is_sized=False,
             cells=SLOPE_CELLS,
+        ),
+        Suite(
+            name="curved_roofs",
+            summary="barrels, cones, domes and caps: 2, 8 and 30 pulses per m2, 1 to 5 cm of noise",
+            make=lambda seed, _: curved_roofs(seed),
+            scanner=OUTLINE_SCANNER,
+            size_m=(150.0, 250.0),
+            is_sized=False,
+            cells=CURVED_CELLS,
         ),
         Suite(
             name="trust",

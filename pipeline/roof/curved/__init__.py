@@ -1,0 +1,1 @@
+"""Curved roofs: barrels, cones and domes, recognised by fit and drawn as facets."""
