@@ -30,7 +30,9 @@ from benchmarks.entries import fill_page, markdown_table
 from benchmarks.run_scores import val3dity_report
 from pipeline.ruler.simulation.suites import SUITES
 
-SIMULATED = [name for name in SUITES if name not in {"sweep", "trust", "outline_shapes", "broken_slopes", "curved_roofs"}]
+SIMULATED = [
+    name for name in SUITES if name not in {"sweep", "trust", "outline_shapes", "broken_slopes", "curved_roofs"}
+]
 SWEEP = {f"sweep-{cell.key}": cell for cell in SUITES["sweep"].cells}
 """The sweep is one scene that is surveyed many times."""
 LODS = "1.2,1.3,2.2"

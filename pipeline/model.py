@@ -89,6 +89,11 @@ class RoofType(StrEnum):
     UNKNOWN = "unknown"
     NONE = "none"
 
+    @property
+    def is_curved(self) -> bool:
+        """Whether its faces are facets of one surface."""
+        return self in (RoofType.BARREL, RoofType.CONE, RoofType.DOME)
+
 
 class HeightSource(StrEnum):
     """Where the height of a model comes from: points, or an attribute of its footprint."""
@@ -433,7 +438,7 @@ class ModelQuality:
     bic_margin: float = math.nan
     """By how much the information criterion of the chosen form is below the next one's; nan where none competed."""
     is_curved: bool = False
-    """True where most of the roof is one surface that bends steadily: a dome, a barrel."""
+    """True where most of the roof is one surface that bends steadily: by its type or by its planes."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

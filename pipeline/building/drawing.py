@@ -65,8 +65,7 @@ def own_model(building: Building, segmentation: Segmentation, roof: RoofPoints, 
     elif drawn.planes is not None:
         planes = drawn.planes
     known = segmentation.roof_type or drawn.roof_type
-    if segmentation.faces is not None or drawn.roof_type is not None:
-        # a primitive or a curve is one form: with a side made level it would be another
+    if segmentation.faces is not None or drawn.roof_type is not None:  # one form: with a side made level, another
         parts = large_parts(solid_parts(drawn, list(planes), ground_z_m, roof.limit_mm), settings.min_part_area_m2)
         return DrawnModel(
             lod="2.2",

@@ -96,7 +96,8 @@ BUILDINGS = (
         TEXT,
         NONE,
         "`flat`, `pent`, `gable`, `half-hip`, `hip`, `pyramid`, `gambrel`, `mansard`, `butterfly`, `sawtooth`, "
-        "`l-shape`, `t-shape`, `cross`, `combination`, `unknown`, or `none` without a model: the main roof decides",
+        "`l-shape`, `t-shape`, `cross`, `barrel`, `cone`, `dome`, `combination`, `unknown`, or `none` without a model: "
+        "the main roof decides",
         required=True,
     ),
     Column(
@@ -289,8 +290,8 @@ BUILDINGS = (
         "is_curved",
         BOOL,
         NONE,
-        "at least half of the roof is one surface that bends steadily outwards (a dome, a barrel, a cone), "
-        "modelled as many planes: at least five directions, each next plane turned by 3 to 26 deg",
+        "`roof_type` is `barrel`, `cone` or `dome`, or at least half of the roof is one surface that bends steadily "
+        "outwards, modelled as planes: at least five directions, each next one turned by 3 to 26 deg",
         required=True,
     ),
     Column(

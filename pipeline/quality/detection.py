@@ -49,7 +49,7 @@ def confidence_of(record: BuildingResult) -> float:
     """The same of a delivered model, and of the model that a block replaced; nan for other blocks, or without one."""
     if record.footprint is None or not record.planes or not math.isnan(record.replaced_confidence):
         return record.replaced_confidence
-    plane_area_m2 = record.footprint.area / len(record.planes)
+    plane_area_m2 = record.footprint.area / (1 if record.roof_type.is_curved else len(record.planes))
     return detection_confidence(record.quality.noise_m, plane_area_m2, record.ground_noise_m)
 
 

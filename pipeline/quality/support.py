@@ -48,7 +48,7 @@ class Support:
 
 def support_of(record: BuildingResult, candidate: Candidate) -> Support:
     """What the points say of the delivered model of a candidate."""
-    quality, n_faces = record.quality, len(record.faces)
+    quality, n_faces = record.quality, 1 if record.roof_type.is_curved else len(record.faces)
     area_m2 = math.fsum(face.polygon.area for face in record.faces)
     beside_m2, level_share = 0.0, math.nan
     if candidate.footprint is not None and record.footprint is not None and area_m2 > 0.0:

@@ -13,8 +13,9 @@ import shapely
 from shapely import MultiPolygon
 
 from pipeline.errors import BuildingError
-from pipeline.model import Decision, DecisionKind, LabelArray, Outcome, Plane
+from pipeline.model import Decision, DecisionKind, Outcome, Plane
 from pipeline.registry import extra
+from pipeline.roof.bending_planes import may_be_curved
 from pipeline.roof.named_form import ARRANGEMENT, MOST_TEMPLATE_POINTS, SIMPLER, TEMPLATES, NamedForm, RankedFaces
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.plan import RoofPoints, arranged_faces, drawn_outline, partition_roof
@@ -40,9 +41,9 @@ def arranged_forms(
 ) -> Iterator[FaceForm]:
     """The arrangement; behind it coarser ones and the traced faces, drawn only where no solid of it is valid.
 
-    Where points are few, templates compete with the arrangement: the better go first, worse ones last of all. Given
-    outlines of many short edges are made simpler before faces are traced: those are drawn back to be valid. What lost
-    a competition without being drawn is added to `decisions`.
+    A curved surface goes before it where one describes the roof better. Where points are few, templates compete with
+    the arrangement: the better go first, worse ones last of all. Given outlines of many short edges are made simpler
+    before faces are traced: those are drawn back to be valid. What lost undrawn is added to `decisions`.
     """
     outline_mm = drawn_outline(roof, settings)
     if roof.footprint_mm is not None:
@@ -50,7 +51,7 @@ def arranged_forms(
     elif roof.guides:
         with extra("guide_steps")():
             outline_mm = extra("guided_outline")(outline_mm, roof.guides, roof.xy_mm, roof.guide_distance_m)
-    if may_be_curved(roof.labels, planes):
+    if not roof.guides and may_be_curved(planes, roof.labels):
         from pipeline.roof.curved.curved_form import curved_forms
 
         yield from curved_forms(roof, planes, outline_mm, decisions)
@@ -75,10 +76,6 @@ def arranged_forms(
 
         yield from traced_forms(plan, roof, settings)
     yield from last
-
-
-def may_be_curved(labels: LabelArray, planes: Sequence[Plane]) -> bool:
-    return len(planes) >= 3
 
 
 def template_forms(roof: RoofPoints, lack: BuildingError, settings: RoofSettings) -> Iterator[FaceForm]:

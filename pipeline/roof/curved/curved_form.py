@@ -25,12 +25,14 @@ from pipeline.roof.partition import RoofPartition
 from pipeline.roof.plan import RoofPoints
 
 _LEAST_TOLERANCE_M, _MOST_TOLERANCE_M = 0.01, 0.05
-"""Facets follow the surface as nearly as its points do, within these limits."""
+"""Facets follow the surface as nearly as its points do, those of a dome less nearly, within these limits."""
+_BOTH_WAYS = 1.5
+"""Times that tolerance on a dome, whose facets leave it in two directions."""
 _MOST_SIGMAS = 3.0
 """Farther points are not of the surface; each costs no more than one at this distance."""
 _LEAST_ON_IT = 0.85
 """Share of the roof points."""
-_AS_NOISY = 1.1
+_AS_NOISY = 1.25
 """Most times the noise of the points about their planes that they may lie about the surface."""
 _LEAST_TURN_DEG, _LEAST_SLOPE_DEG = 20.0, 10.0
 """Least turn of a barrel or dome over its points, least slope of a cone: roofs that undulate are level."""
@@ -51,14 +53,12 @@ def curved_forms(
     """
     shift = np.floor(roof.points.mean(axis=0))
     near = roof.points - shift
-    moved = [
-        dataclasses.replace(one, c=one.c + one.a * shift[0] + one.b * shift[1] - shift[2]) for one in planes
-    ]
+    moved = [dataclasses.replace(one, c=one.c + one.a * shift[0] + one.b * shift[1] - shift[2]) for one in planes]
     sigma_m, of_planes_m = _about_planes(near, moved, roof)
     found = [
         (_cost(one.distances_m, one.sigma_m, len(one.parameters) + _KIND_TERMS), k, one)
-        for k, one in enumerate(fitted_surfaces(near, moved, roof.labels))
-        if one.sigma_m <= _AS_NOISY * sigma_m and _is_whole(one, near, outline_mm, shift)
+        for k, one in enumerate(fitted_surfaces(near, moved, roof.labels, _AS_NOISY * sigma_m))
+        if _is_whole(one, near, outline_mm, shift)
     ]
     # all are counted in the noise of the best one: a better fit is a shorter description
     if not found:
@@ -70,10 +70,9 @@ def curved_forms(
     margin = _cost(of_planes_m, noise_m, _PLANE_TERMS * len(planes)) - cost
     if margin <= 0.0:
         return
-    decisions.append(
-        Decision(kind=DecisionKind.FORM, name=ARRANGEMENT, outcome=Outcome.OUTDONE, bic_margin=-margin)
-    )
-    tolerance_m = min(max(surface.sigma_m, _LEAST_TOLERANCE_M), _MOST_TOLERANCE_M)
+    decisions.append(Decision(kind=DecisionKind.FORM, name=ARRANGEMENT, outcome=Outcome.OUTDONE, bic_margin=-margin))
+    wanted_m = surface.sigma_m * (_BOTH_WAYS if surface.kind is RoofType.DOME else 1.0)
+    tolerance_m = min(max(wanted_m, _LEAST_TOLERANCE_M), _MOST_TOLERANCE_M)
     for turn in _TURNS:
         words = f"{_words(surface)}; facets within {tolerance_m:.3f} m"
         yield NamedForm(CURVED, partial(_faces, surface, outline_mm, shift, tolerance_m, turn), words)
@@ -85,7 +84,9 @@ def _about_planes(near: FloatArray, planes: Sequence[Plane], roof: RoofPoints) -
     a, b, c = coefficients[roof.labels].T
     away = (near[:, 2] - a * near[:, 0] - b * near[:, 1] - c) / np.sqrt(1.0 + a * a + b * b)
     away = np.where(roof.labels >= 0, away, np.inf)
-    return 1.4826 * float(np.median(np.abs(away[roof.labels >= 0]))), away
+    known = np.abs(away[roof.labels >= 0])
+    free = len(known) / max(len(known) - 3 * len(planes), 1)  # a plane follows some of the noise
+    return 1.4826 * float(np.median(known)) * math.sqrt(free), away
 
 
 def _cost(away_m: FloatArray, noise_m: float, terms: int) -> float:
@@ -128,7 +129,9 @@ def _words(surface: Surface) -> str:
     if surface.kind is RoofType.DOME:
         return f"dome of radius {surface.parameters[3]:.2f} m, {sigma}"
     width, height = surface.axes
-    size = f"radius {width:.2f} m" if len(surface.parameters) < 5 else f"half width {width:.2f} m, height {height:.2f} m"
+    size = (
+        f"radius {width:.2f} m" if len(surface.parameters) < 5 else f"half width {width:.2f} m, height {height:.2f} m"
+    )
     return f"barrel of {size}, axis at {math.degrees(math.pi / 2 - surface.parameters[0]) % 180.0:.1f} deg, {sigma}"
 
 

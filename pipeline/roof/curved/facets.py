@@ -152,7 +152,12 @@ def _rings(surface: Surface, reach: float, tolerance_m: float, turn: float) -> l
     counts = [most]
     for k in range(len(places) - 2, -1, -1):
         arc, width = 2.0 * math.pi * places[k] / counts[0], places[k + 1] - places[k]
-        counts.insert(0, counts[0] // 2 if arc < _SHORT * width and counts[0] % 2 == 0 and counts[0] > 2 * _FEWEST_AT_TOP else counts[0])
+        counts.insert(
+            0,
+            counts[0] // 2
+            if arc < _SHORT * width and counts[0] % 2 == 0 and counts[0] > 2 * _FEWEST_AT_TOP
+            else counts[0],
+        )
     wide = [1.0 + _OUT * (1.0 - math.cos(math.pi / count)) for count in counts]
 
     def corner(ring: int, k: int) -> Corner:

@@ -8,17 +8,21 @@ of all points (Gauss and Newton; weights of Geman and McClure).
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
-from pipeline.model import FloatArray, Plane, RoofType
+from pipeline.model import FloatArray, LabelArray, Plane, RoofType
 
 _REACHES_M = (1.0, 0.5, 0.25)
 """From step to step, points farther than this count less, then those beyond `_SIGMAS` standard deviations."""
-_STEPS = 14
+_STEPS, _PATIENCE, _HOPELESS, _STILL = 14, 4, 6.0, 1e-5
+"""Most steps; after some, a fit ends whose points scatter by many times what is wanted, or whose parameters rest."""
 _SIGMAS = 3.0
+_STRETCHES = (1.0, 0.7, 1.4)
+"""Heights of the first ellipses, in radii of the circle."""
 _MAD_TO_SIGMA = 1.4826
 _LEAST_SIGMA_M = 0.005
 _TINY = 1e-9
@@ -46,8 +50,8 @@ class Surface:
         return self.parameters[3], self.parameters[-1]
 
 
-def fitted_surfaces(points: FloatArray, planes: Sequence[Plane], labels: FloatArray) -> list[Surface]:
-    """The surfaces of each kind through points (n, 3), metres, near the origin; those that have a beginning.
+def fitted_surfaces(points: FloatArray, planes: Sequence[Plane], labels: LabelArray, most_m: float) -> list[Surface]:
+    """The surfaces of each kind about which points (n, 3), metres, near the origin, scatter by no more than `most_m`.
 
     `labels` (n,) are the planes of the points, -1 for none. Barrels come as circles and as ellipses.
     """
@@ -63,14 +67,12 @@ def fitted_surfaces(points: FloatArray, planes: Sequence[Plane], labels: FloatAr
         first = begin(known, slopes, weights)
         if first is None:
             continue
-        one = _fitted(kind, points, distances, first)
-        if one is None:
-            continue
-        found.append(one)
+        one = _fitted(kind, points, distances, first, most_m)
+        found.extend([one] if one is not None else [])
         if kind is RoofType.BARREL:
-            *others, radius = one.parameters
-            ellipse = _fitted(kind, points, distances, np.array([*others, radius, radius]))
-            found.extend([ellipse] if ellipse is not None else [])
+            starts = _ellipses(first if one is None else np.array(one.parameters))
+            ellipses = (_fitted(kind, points, distances, start, most_m) for start in starts)
+            found.extend(itertools.islice(filter(None, ellipses), 1))
     return found
 
 
@@ -113,6 +115,13 @@ def _first_barrel(points: FloatArray, slopes: FloatArray, weights: FloatArray) -
     return np.array([azimuth, at, base, math.sqrt(square)]) if square > 0.0 else None
 
 
+def _ellipses(circle: FloatArray) -> Iterator[FloatArray]:
+    """Beginnings of ellipses: as high as a circle, lower, and higher, with the same crown."""
+    azimuth, at, base, radius = circle.tolist()
+    for stretch in _STRETCHES:
+        yield np.array([azimuth, at, base + (1.0 - stretch) * radius, radius, stretch * radius])
+
+
 def _first_cone(points: FloatArray, slopes: FloatArray, weights: FloatArray) -> FloatArray | None:
     """The apex is where the planes meet; the slope is their mean one."""
     root = np.sqrt(weights)
@@ -149,13 +158,17 @@ def _fitted(
     points: FloatArray,
     distances: Callable[[FloatArray, FloatArray], FloatArray],
     first: FloatArray,
+    most_m: float,
 ) -> Surface | None:
-    """The robust least squares from a first surface; None where it runs away."""
+    """The robust least squares from a first surface; None where it runs away or the points scatter by more."""
     now = first.copy()
     extent = float(np.abs(points).max()) * 20.0
     for step in range(_STEPS):
         away = distances(points, now)
-        reach = _REACHES_M[step] if step < len(_REACHES_M) else _SIGMAS * _sigma(away)
+        sigma_m = _sigma(away)
+        if step > _PATIENCE and sigma_m > _HOPELESS * most_m:
+            return None
+        reach = _REACHES_M[step] if step < len(_REACHES_M) else _SIGMAS * sigma_m
         weights = reach * reach / (reach * reach + away * away)
         rows = np.empty((len(points), len(now)))
         for k in range(len(now)):
@@ -166,11 +179,16 @@ def _fitted(
         if change is None:
             return None
         now = now + change
+        if step > _PATIENCE and np.abs(change).max() < _STILL:
+            break
         if not np.isfinite(now).all() or np.abs(now).max() > extent or (now[3:] <= 0.0).any():
             return None
     parameters = np.round(now, _DECIMALS)
     away = distances(points, parameters)
-    return Surface(kind=kind, parameters=tuple(parameters.tolist()), sigma_m=_sigma(away), distances_m=away)
+    sigma_m = _sigma(away)
+    if not sigma_m <= most_m:
+        return None
+    return Surface(kind=kind, parameters=tuple(parameters.tolist()), sigma_m=sigma_m, distances_m=away)
 
 
 def _sigma(away: FloatArray) -> float:

@@ -19,7 +19,9 @@ from pipeline.ruler.simulation.sweep import Cell
 
 OF_EACH = 4
 """Buildings of each form in a scene."""
-CELLS = tuple(Cell(density_per_m2=density, noise_m=noise) for density in (2.0, 8.0, 30.0) for noise in (0.01, 0.02, 0.05))
+CELLS = tuple(
+    Cell(density_per_m2=density, noise_m=noise) for density in (2.0, 8.0, 30.0) for noise in (0.01, 0.02, 0.05)
+)
 
 _STRIP_M, _MARGIN_M = 150.0, 4.0
 _SECTORS, _RINGS, _STRIPS = 36, 9, 40
@@ -36,7 +38,9 @@ def _part(outline: tuple[Place, ...], planes: list[Line]) -> list[RoofPart]:
 
 
 def _round(radius: float, sides: int = 2 * _SECTORS) -> tuple[Place, ...]:
-    return tuple((radius * math.cos(2 * math.pi * k / sides), radius * math.sin(2 * math.pi * k / sides)) for k in range(sides))
+    return tuple(
+        (radius * math.cos(2 * math.pi * k / sides), radius * math.sin(2 * math.pi * k / sides)) for k in range(sides)
+    )
 
 
 def _tangents(radius: float, most_deg: float, count: int, stretch: float = 1.0) -> list[tuple[float, float]]:

@@ -13,7 +13,15 @@ import numpy as np
 import shapely
 
 from pipeline.model import FloatArray, Plane, RoofType
-from pipeline.ruler.simulation.roofs import ROOF_TYPES, ROOFS, BrokenForm, CurvedForm, FaceRings, RoofDimensions, RoofShape
+from pipeline.ruler.simulation.roofs import (
+    ROOF_TYPES,
+    ROOFS,
+    BrokenForm,
+    CurvedForm,
+    FaceRings,
+    RoofDimensions,
+    RoofShape,
+)
 
 _STEP_M = 0.05
 """Step of the central differences of the terrain."""

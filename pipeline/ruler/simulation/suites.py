@@ -13,9 +13,9 @@ from pipeline.ruler.simulation.bridges_and_vans import SCANNER as STREET_SCANNER
 from pipeline.ruler.simulation.bridges_and_vans import bridges_and_vans
 from pipeline.ruler.simulation.broken_slopes import CELLS as SLOPE_CELLS
 from pipeline.ruler.simulation.broken_slopes import broken_slopes
+from pipeline.ruler.simulation.city import CITY_SCANNER, TILE_M, CityPlan, Extent, city, hillside
 from pipeline.ruler.simulation.curved_roofs import CELLS as CURVED_CELLS
 from pipeline.ruler.simulation.curved_roofs import curved_roofs
-from pipeline.ruler.simulation.city import CITY_SCANNER, TILE_M, CityPlan, Extent, city, hillside
 from pipeline.ruler.simulation.hofmann310 import SCANNER as HOFMANN_SCANNER
 from pipeline.ruler.simulation.hofmann310 import hofmann310
 from pipeline.ruler.simulation.low_buildings import CELLS as LOW_CELLS

@@ -1,0 +1,64 @@
+"""Whether roof planes may belong to one curved surface, by their directions alone: most roofs end here at once."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from pipeline.model import LabelArray, Plane
+
+MIN_TURN_DEG, MIN_DIRECTIONS = 3.0, 5
+"""Planes that differ by less have one direction; a hip roof, also on an L, has four."""
+_MOST, _FEWEST = 0.8, 3
+"""Share of the points that the largest directions hold, and how many of them: fewer hold it on a gable."""
+_LEVEL_ALONG, _LARGE, _MOST_TURN_DEG = 0.05, 0.04, 35.0
+"""Slope of the planes of a barrel along its axis; the turn from one large plane to the next, by its share of points."""
+_TOUCHING_M = 0.15
+"""Distance of the planes of a curve from a sphere that they touch; a cone's has radius 0, one of many in a barrel."""
+_ROUNDS = 4
+
+
+def directions_of(planes: Sequence[Plane]) -> list[list[int]]:
+    """The planes of each direction: one joins the first direction that is nearer than the least turn."""
+    kept: list[tuple[tuple[float, float, float], list[int]]] = []
+    for k, plane in enumerate(planes):
+        x, y, z = plane.normal
+        for (p, q, r), members in kept:
+            if x * p + y * q + z * r > math.cos(math.radians(MIN_TURN_DEG)):
+                members.append(k)
+                break
+        else:
+            kept.append(((x, y, z), [k]))
+    return [members for _, members in kept]
+
+
+def may_be_curved(planes: Sequence[Plane], labels: LabelArray) -> bool:
+    """Whether most points lie on planes that slope along one line, or touch one sphere; `labels` (n,), -1 for none."""
+    if len(planes) < _FEWEST:
+        return False
+    counts = np.bincount(labels[labels >= 0], minlength=len(planes))
+    order = np.argsort(-counts, kind="stable").tolist()
+    directions = directions_of([planes[k] for k in order])
+    held = np.sort([counts[[order[k] for k in members]].sum() for members in directions])[::-1]
+    needed = 1 + int(np.count_nonzero(np.cumsum(held) < _MOST * held.sum()))
+    if needed < _FEWEST:
+        return False
+    share = counts / counts.sum()
+    a, b, c = np.array([plane.coefficients for plane in planes]).T
+    size = np.sqrt(1.0 + a * a + b * b)
+    if needed < MIN_DIRECTIONS:  # a sphere touches any three or four planes
+        xx, yy, xy = (float(np.sum(share * one * other)) for one, other in ((a, a), (b, b), (a, b)))
+        across = 0.5 * math.atan2(2.0 * xy, xx - yy)
+        along = float(np.sum(share * (b * math.cos(across) - a * math.sin(across)) ** 2))
+        slopes = (a * math.cos(across) + b * math.sin(across))[share >= _LARGE]
+        turns = np.diff(np.sort(np.degrees(np.arctan(slopes))))
+        return along < _LEVEL_ALONG**2 and bool(turns.max(initial=0.0) <= _MOST_TURN_DEG)
+    touching, weights = np.column_stack([a, b, -np.ones(len(a)), -size]) / size[:, None], share
+    for _ in range(_ROUNDS):
+        root = np.sqrt(weights)
+        sphere = np.linalg.lstsq(touching * root[:, None], -c / size * root, rcond=None)[0]
+        away = np.abs(np.sum(touching * sphere, axis=1) + c / size)
+        weights = share / (1.0 + (away / _TOUCHING_M) ** 2)
+    return float(share[away < _TOUCHING_M].sum()) >= _MOST
