@@ -26,11 +26,11 @@ from pipeline.model import (
 from pipeline.quality.model_quality import drawn_outline_sigma_m, model_quality
 from pipeline.quality.validity import check_solid
 from pipeline.registry import extra
-from pipeline.roof.bending_planes import MIN_DIRECTIONS, directions_of
 from pipeline.roof.footprint import hull_of_points
 from pipeline.roof.plan import wall_outline, walls_of
 from pipeline.roof.roof_type import roof_type
 from pipeline.roof.solid import LodParts, renumbered, united
+from pipeline.terrain.roof_patches import has_directions
 
 
 def record_of(
@@ -65,8 +65,8 @@ def record_of(
         is_planar=model.lod == "2.2",
         bic_margin=model.bic_margin,
     )
-    if model.lod == "2.2" and len(directions_of(planes)) >= MIN_DIRECTIONS:
-        from pipeline.roof.curved.bent_roofs import is_curved_roof
+    if model.lod == "2.2" and has_directions(np.reshape([plane.normal for plane in planes], (-1, 3))):
+        from pipeline.quality.bent_roofs import is_curved_roof
 
         quality = dataclasses.replace(quality, is_curved=is_curved_roof(planes, faces, solids, model.roof_type))
     walls = walls_of(footprint, roof, building.settings.roof)

@@ -9,10 +9,10 @@ import numpy as np
 
 from pipeline.model import LabelArray, Plane
 
-MIN_TURN_DEG, MIN_DIRECTIONS = 3.0, 5
-"""Planes that differ by less have one direction; a hip roof, also on an L, has four."""
-_MOST, _FEWEST = 0.8, 3
-"""Share of the points that the largest directions hold, and how many of them: fewer hold it on a gable."""
+_ONE_DIRECTION = math.cos(math.radians(3.0))
+_MOST, _FEWEST, _AROUND = 0.8, 3, 5
+"""Share of the points that the largest directions hold; how many do on a barrel, on a cone: two on a gable, four on a
+hip roof, also on an L."""
 _LEVEL_ALONG, _LARGE, _MOST_TURN_DEG = 0.05, 0.04, 35.0
 """Slope of the planes of a barrel along its axis; the turn from one large plane to the next, by its share of points."""
 _TOUCHING_M = 0.15
@@ -20,35 +20,23 @@ _TOUCHING_M = 0.15
 _ROUNDS = 4
 
 
-def directions_of(planes: Sequence[Plane]) -> list[list[int]]:
-    """The planes of each direction: one joins the first direction that is nearer than the least turn."""
-    kept: list[tuple[tuple[float, float, float], list[int]]] = []
-    for k, plane in enumerate(planes):
-        x, y, z = plane.normal
-        for (p, q, r), members in kept:
-            if x * p + y * q + z * r > math.cos(math.radians(MIN_TURN_DEG)):
-                members.append(k)
-                break
-        else:
-            kept.append(((x, y, z), [k]))
-    return [members for _, members in kept]
-
-
 def may_be_curved(planes: Sequence[Plane], labels: LabelArray) -> bool:
     """Whether most points lie on planes that slope along one line, or touch one sphere; `labels` (n,), -1 for none."""
     if len(planes) < _FEWEST:
         return False
     counts = np.bincount(labels[labels >= 0], minlength=len(planes))
-    order = np.argsort(-counts, kind="stable").tolist()
-    directions = directions_of([planes[k] for k in order])
-    held = np.sort([counts[[order[k] for k in members]].sum() for members in directions])[::-1]
-    needed = 1 + int(np.count_nonzero(np.cumsum(held) < _MOST * held.sum()))
+    normals, left, held = np.array([plane.normal for plane in planes]), counts.copy(), [0]
+    while left.any():
+        near = np.sum(normals * normals[np.argmax(left)], axis=1) > _ONE_DIRECTION
+        held.append(int(left[near].sum()))
+        left[near] = 0
+    needed = 1 + int(np.count_nonzero(np.cumsum(sorted(held)[::-1]) < _MOST * counts.sum()))
     if needed < _FEWEST:
         return False
     share = counts / counts.sum()
     a, b, c = np.array([plane.coefficients for plane in planes]).T
     size = np.sqrt(1.0 + a * a + b * b)
-    if needed < MIN_DIRECTIONS:  # a sphere touches any three or four planes
+    if needed < _AROUND:  # a sphere touches any three or four planes
         xx, yy, xy = (float(np.sum(share * one * other)) for one, other in ((a, a), (b, b), (a, b)))
         across = 0.5 * math.atan2(2.0 * xy, xx - yy)
         along = float(np.sum(share * (b * math.cos(across) - a * math.sin(across)) ** 2))

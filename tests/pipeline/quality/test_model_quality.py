@@ -12,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.model import FloatArray, ModelQuality, Plane
+from pipeline.quality.bent_roofs import is_curved_roof
 from pipeline.quality.model_quality import model_quality
 from pipeline.quality.ridge_height import _weights
 from pipeline.quality.unseen_roof import Raster, _nearest_squares
-from pipeline.roof.curved.bent_roofs import is_curved_roof
 from pipeline.roof.solid import SolidPart, solid_parts
 from pipeline.segmentation.facet_geometry import fit_plane
 
