@@ -15,22 +15,17 @@ already are not repeated: delete them after a change of code.
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
-import itertools
-import json
 import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import shapely
 
-from benchmarks.entries import Entry, markdown_table
-from benchmarks.survey_runs import ROOT, run_survey
-from pipeline.extras.compare.compare import Variant
+from benchmarks.entries import markdown_table
+from benchmarks.suite_surveys import asked, by_checkout, measured
 from pipeline.model import BoolArray
 from pipeline.ruler.evaluation.building_matching import MIN_SHARE, mostly_on, one_to_one, overlapping, sound_polygons
 from pipeline.ruler.evaluation.face_matching import Planes, compared, flattened
@@ -38,14 +33,9 @@ from pipeline.ruler.evaluation.face_scores import MIN_FACE_POINTS
 from pipeline.ruler.evaluation.models import RoofModel
 from pipeline.ruler.evaluation.reading import read_models
 from pipeline.ruler.simulation.broken_slopes import CELLS
-from pipeline.ruler.simulation.dataset import simulate
 from pipeline.ruler.simulation.roofs import ROOF_TYPES, BrokenForm
-from pipeline.ruler.simulation.seeds import seed_of
 from pipeline.ruler.simulation.sweep import Cell
-from pipeline.settings import RunSettings
 
-REQUIRED = Cell(density_per_m2=8.0, noise_m=0.02)
-"""The survey of the required figure."""
 MAX_ANGLE_DEG, MAX_OFFSET_M = 5.0, 0.15
 LEAST_M2, LEAST_POINTS, LEAST_SPACINGS = 1.0, MIN_FACE_POINTS, 2.0
 """Least area in plan, points on it, and width of a face that counts."""
@@ -115,47 +105,6 @@ def judged(models: Sequence[RoofModel], houses: Sequence[RoofModel], per_m2: flo
         )
 
 
-def write_outlines(truth: Path, path: Path) -> None:
-    """The true outlines as GeoJSON in the CRS of the scene."""
-    features = [
-        {"type": "Feature", "properties": {"id": one.building_id}, "geometry": shapely.geometry.mapping(one.footprint)}
-        for one in read_models(truth).models
-    ]
-    crs = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::25832"}}
-    path.write_text(json.dumps({"type": "FeatureCollection", "crs": crs, "features": features}), encoding="utf-8")
-
-
-def measured(given: argparse.Namespace, codes: dict[str, Path]) -> list[Judged]:
-    """Make, model and judge all scenes of some draws, with every checkout."""
-    variant, out = Variant(method=RunSettings().general.method), given.out.resolve()
-    cells = CELLS if given.cells == "all" else (REQUIRED,)
-    tasks = list(itertools.product(range(given.draws), cells, codes))
-    for draw, cell in itertools.product(range(given.draws), cells):
-        if not (out / f"{given.split}{draw}" / cell.key / "truth" / "scene.json").exists():
-            chosen = {"density_per_m2": cell.density_per_m2, "noise_m": cell.noise_m}
-            simulate("broken_slopes", out / f"{given.split}{draw}", seed_of(given.split, draw), **chosen)
-        if given.given:
-            survey = out / f"{given.split}{draw}" / cell.key
-            write_outlines(survey / "truth", survey / "outlines.geojson")
-
-    def one(task: tuple[int, Cell, str]) -> list[Judged]:
-        draw, cell, code = task
-        folder = out / f"{given.split}{draw}" / cell.key
-        run = folder / f"models-{code}{'-given' if given.given else ''}"
-        if not (run / "run.json").exists():
-            outlines = folder / "outlines.geojson" if given.given else None
-            entry = Entry(
-                name=folder.name, tiles=(folder / "broken_slopes.laz",), classes="ignore", footprints=outlines
-            )
-            run_survey(entry, variant, run, codes[code])
-        labels = {"code": code, "per_m2": cell.density_per_m2, "noise_m": cell.noise_m}
-        found = judged(read_models(run).models, read_models(folder / "truth").models, cell.density_per_m2)
-        return [dataclasses.replace(row, building=f"{draw}-{row.building}", **labels) for row in found]
-
-    with ThreadPoolExecutor(given.jobs) as pool:
-        return [row for rows in pool.map(one, tasks) for row in rows]
-
-
 def line(name: str, rows: Sequence[Judged]) -> list[str]:
     """A line of a table."""
     wanted, right, wrong = (sum(getattr(row, key) for row in rows) for key in ("wanted", "right", "wrong"))
@@ -174,29 +123,12 @@ def table(rows: Sequence[Judged], key: Callable[[Judged], str]) -> str:
 
 def main() -> int:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--split", choices=("dev", "test"), default="dev")
-    parser.add_argument("--draws", type=int, default=2)
-    parser.add_argument("--cells", choices=("all", "required"), default="all")
-    parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--given", action="store_true", help="give the true outlines")
-    parser.add_argument("--baseline", type=Path, help="another checkout of this repository")
-    given = parser.parse_args()
-    codes = {path.name: path for path in (ROOT, given.baseline and given.baseline.resolve()) if path}
-    if given.baseline and len(codes) == 1:
-        parser.error(
-            f"--baseline {given.baseline} is called {ROOT.name}, as this checkout: give a folder of another name"
-        )
-    rows = measured(given, codes)
-    (given.out / f"{given.split}.json").write_text(json.dumps(list(map(dataclasses.asdict, rows))), encoding="utf-8")
-    for code in codes:
-        own = [row for row in rows if row.code == code]
-        required = [row for row in own if (row.per_m2, row.noise_m) == (REQUIRED.density_per_m2, REQUIRED.noise_m)]
-        print(f"{code}, {given.split} seeds, by survey:\n")
-        print(table(own, lambda row: f"{row.per_m2:g} per m2, {100 * row.noise_m:g} cm"))
-        print(f"{code}, at {REQUIRED.density_per_m2:g} per m2 and {100 * REQUIRED.noise_m:g} cm, by form:\n")
-        print(table(required, lambda row: row.form))
+    given, codes = asked(__doc__)
+
+    def judge(run: Path, truth: Path, cell: Cell) -> list[Judged]:
+        return list(judged(read_models(run).models, read_models(truth).models, cell.density_per_m2))
+
+    by_checkout(measured(given, codes, "broken_slopes", CELLS, judge), codes, given.split, table)
     return 0
 
 
