@@ -6,6 +6,7 @@ _FAMILIES = {
     RoofType.HALF_HIP: RoofType.GABLE,
     RoofType.PYRAMID: RoofType.HIP,
     **dict.fromkeys((RoofType.GAMBREL, RoofType.MANSARD, RoofType.BUTTERFLY, RoofType.SAWTOOTH), RoofType.COMBINATION),
+    **dict.fromkeys((RoofType.BARREL, RoofType.CONE, RoofType.DOME), RoofType.COMBINATION),
     **dict.fromkeys((RoofType.L_SHAPE, RoofType.T_SHAPE, RoofType.CROSS), RoofType.COMBINATION),
 }
 

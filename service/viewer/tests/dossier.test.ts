@@ -151,6 +151,9 @@ test("a dossier says what to rely on and what not, in sentences", () => {
   expect(said.bad).toHaveLength(3);
   expect(said.bad[0]).toMatch(/^14\.0\u202fm² of the roof have no point near them/);
   expect(said.bad.join(" ")).toMatch(/curved.*12\u202f% of the plan were made level/);
+  const dome = trust({ status: "ok", valid: true, is_curved: true, roof_type: "dome" }, []);
+  expect(dome.good.join(" ")).toMatch(/one curved surface, a dome/);
+  expect(dome.bad.join(" ")).not.toMatch(/curved/);
   expect(trust({ status: "failed", reason: "no_plane" }, []).bad).toEqual(["There is no model: no roof plane was found in its points."]);
   expect(trustFigures({ bic_margin: 12 }).map(({ row }) => row["Figure"])).toEqual(["Lead over the next form"]);
 });

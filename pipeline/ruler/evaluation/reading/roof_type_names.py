@@ -21,6 +21,9 @@ ROOF_TYPE_OF_WORD: Mapping[str, RoofType] = {
     "1050": RoofType.HALF_HIP,
     "1060": RoofType.MANSARD,
     "1070": RoofType.PYRAMID,
+    "1080": RoofType.CONE,
+    "1090": RoofType.DOME,
+    "1110": RoofType.BARREL,
     "1130": RoofType.COMBINATION,
     "monopitch": RoofType.PENT,
     "skillion": RoofType.PENT,
@@ -28,6 +31,7 @@ ROOF_TYPE_OF_WORD: Mapping[str, RoofType] = {
     "hipped": RoofType.HIP,
     "half-hipped": RoofType.HALF_HIP,
     "pyramidal": RoofType.PYRAMID,
+    "round": RoofType.BARREL,
 }
 """Meanings of the values: words, and codes of the list of roof types of CityGML. `slanted` is too vague."""
 

@@ -104,7 +104,9 @@ export function trust(properties: Properties, decisions: readonly Decision[]): {
   if (status === "fallback") bad.push(`The roof is not modelled, the building is a block: ${words}.`);
   if (valid === true) good.push("The solid is closed and valid by the rules of ISO 19107.");
   for (const figure of trustFigures(properties)) (figure.isGood ? good : bad).push(figure.words);
-  if (properties["is_curved"] === true) bad.push("The roof is curved: planes only approximate it.");
+  const roofType = properties["roof_type"];
+  if (roofType === "barrel" || roofType === "cone" || roofType === "dome") good.push(`The roof is one curved surface, a ${roofType}: its faces are facets of it.`);
+  else if (properties["is_curved"] === true) bad.push("The roof is curved: planes only approximate it.");
   if (properties["touches_data_edge"] === true) bad.push("It touches the edge of the data: a part of it may be missing.");
   const offset = number(properties["strip_offset_m"]);
   if (offset !== null) bad.push(`Flight strips differed by ${measure(offset, 2, "m")} here; they were aligned first.`);
@@ -170,6 +172,7 @@ const FORMS: Record<string, string> = {
   arrangement: "Arrangement of the planes' lines",
   templates: "Simple shapes",
   traced: "Traced faces",
+  curved: "Facets of a curve",
   primitive: "The method's whole form",
   block: "Level block",
   further: "Further forms",

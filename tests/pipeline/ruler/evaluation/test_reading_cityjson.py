@@ -201,7 +201,7 @@ def test_the_roof_type_is_what_the_file_says(tmp_path: Path) -> None:
             "no points": "unknown",
         },
         "rf_roof_type": {"horizontal": "flat", "slanted": "unknown"},
-        "roof_type": {"gable": "gable", "combination": "combination", "dome": "unknown"},
+        "roof_type": {"gable": "gable", "combination": "combination", "dome": "dome", "onion": "unknown"},
         "roofType": {"1000": "flat", 1030: "gable", "1040": "hip", "9999": "unknown"},
     }
     for attribute, values in found.items():
