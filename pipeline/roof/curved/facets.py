@@ -22,6 +22,9 @@ STEEPEST_DEG = 75.0
 _SAGITTA, _OUT = 1.5, 2.0 / 3.0
 """Sagitta of a facet in tolerances, and the share of it by which its ends lie outside: the squares are least."""
 _FEWEST_SECTORS, _FEWEST_AT_TOP = 16, 5
+_NEAR_M = 0.05
+"""Edges of facets that pass a corner of the outline at this distance go through it."""
+_SMALLER = 0.15
 _BEYOND_M = 0.2
 """How far facets go beyond the outline."""
 _SHORT = 0.6
@@ -50,15 +53,36 @@ class Facet:
 def facets_of(surface: Surface, outline: FloatArray, tolerance_m: float, turn: float) -> list[Facet]:
     """Facets over all of an outline, whose corners (n, 2) are given, no farther than a tolerance from the surface.
 
-    `turn` is the share of a sector by which those of cones and domes are turned.
+    `turn`, below 1, is the share of a sector by which those of cones and domes are turned; facets are smaller by a part
+    of it, too, so that other corners follow.
     """
+    sagitta_m = _SAGITTA * tolerance_m * (1.0 - _SMALLER * turn)
     if surface.kind is RoofType.BARREL:
-        return _strips(surface, outline, tolerance_m)
+        return _strips(surface, outline, sagitta_m)
     x, y, *_ = surface.parameters
-    reach = float(np.hypot(outline[:, 0] - x, outline[:, 1] - y).max()) + _BEYOND_M
+    around = outline - np.array([x, y])
     if surface.kind is RoofType.CONE:
-        return _sectors(surface, reach, tolerance_m, turn)
-    return _rings(surface, reach, tolerance_m, turn)
+        return _sectors(surface, around, sagitta_m, turn)
+    return _rings(surface, around, 0.5 * sagitta_m, turn)
+
+
+def _snapped(places: FloatArray, corners: FloatArray, near: FloatArray) -> FloatArray:
+    """Ascending places, each at the nearest corner (n,) of the outline that is as near to it as that corner allows."""
+    away = np.abs(places[:, None] - corners[None, :])
+    nearest = away.argmin(axis=1)
+    moves = away[np.arange(len(places)), nearest] < near[nearest]
+    return np.where(moves, corners[nearest], places)
+
+
+def _angles(around: FloatArray, count: int, turn: float) -> tuple[FloatArray, float]:
+    """The angles (count + 1,) between sectors, through corners of an outline that they nearly meet; reach of them."""
+    away = np.hypot(around[:, 0], around[:, 1])
+    step = 2.0 * math.pi / count
+    angles = (np.arange(count) + turn) * step
+    corners = np.arctan2(around[:, 1], around[:, 0]) % (2.0 * math.pi)
+    corners = np.where(corners < (turn - 0.5) * step, corners + 2.0 * math.pi, corners)
+    angles = _snapped(angles, corners, np.minimum(_NEAR_M / np.maximum(away, _NEAR_M), 0.3 * step))
+    return np.append(angles, angles[0] + 2.0 * math.pi), float(away.max()) + _BEYOND_M
 
 
 def _nodes(width: float, height: float, ends: tuple[float, float], sagitta_m: float) -> tuple[FloatArray, FloatArray]:
@@ -94,7 +118,7 @@ def _bridged(
     return places, heights
 
 
-def _strips(surface: Surface, outline: FloatArray, tolerance_m: float) -> list[Facet]:
+def _strips(surface: Surface, outline: FloatArray, sagitta_m: float) -> list[Facet]:
     """Strips along the axis of a barrel."""
     azimuth, at, base, *_ = surface.parameters
     width, height = surface.axes
@@ -102,7 +126,10 @@ def _strips(surface: Surface, outline: FloatArray, tolerance_m: float) -> list[F
     across = np.array([-along[1], along[0]])
     v, u = outline @ across - at, outline @ along
     ends = float(v.min()), float(v.max())
-    places, heights = _bridged(*_nodes(width, height, ends, _SAGITTA * tolerance_m), width, height, ends)
+    places, heights = _bridged(*_nodes(width, height, ends, sagitta_m), width, height, ends)
+    snapped = _snapped(places, v, np.full(len(v), _NEAR_M))
+    heights += (snapped - places) * np.gradient(heights, places)
+    places = snapped
     slopes = np.diff(heights) / np.diff(places)
     first, last = min(places[0], ends[0] - _BEYOND_M), max(places[-1], ends[1] + _BEYOND_M)
     heights[0] += slopes[0] * (first - places[0])
@@ -120,22 +147,22 @@ def _strips(surface: Surface, outline: FloatArray, tolerance_m: float) -> list[F
     ]
 
 
-def _sectors(surface: Surface, reach: float, tolerance_m: float, turn: float) -> list[Facet]:
+def _sectors(surface: Surface, around: FloatArray, sagitta_m: float, turn: float) -> list[Facet]:
     """Sectors of a cone."""
     x, y, top, slope = surface.parameters
-    sag = _SAGITTA * tolerance_m / (reach * slope / math.hypot(1.0, slope))
+    reach = float(np.hypot(around[:, 0], around[:, 1]).max())
+    sag = sagitta_m / (reach * slope / math.hypot(1.0, slope))
     count = max(_FEWEST_SECTORS, math.ceil(math.pi / math.sqrt(2.0 * sag)))
-    half = math.pi / count
-    wide = 1.0 + _OUT * (1.0 - math.cos(half))
-    angles = (np.arange(count + 1) + turn) * 2.0 * half
+    wide = 1.0 + _OUT * (1.0 - math.cos(math.pi / count))
+    angles, reach = _angles(around, count, turn)
     ring = [(x + reach * math.cos(a), y + reach * math.sin(a), top - slope / wide * reach) for a in angles.tolist()]
     return [Facet(corners=((x, y, top), ring[k], ring[k + 1])) for k in range(count)]
 
 
-def _rings(surface: Surface, reach: float, tolerance_m: float, turn: float) -> list[Facet]:
+def _rings(surface: Surface, around: FloatArray, sagitta: float, turn: float) -> list[Facet]:
     """A level top and rings of sectors of a sphere; towards the top each sector takes the place of two."""
     x, y, base, radius = surface.parameters
-    sagitta = _SAGITTA * 0.5 * tolerance_m
+    reach = float(np.hypot(around[:, 0], around[:, 1]).max()) + _BEYOND_M
     places, heights = _nodes(radius, radius, (-reach, reach), sagitta)
     if len(places) % 2 == 1:  # a level facet in the middle
         places, heights = _even(radius, reach, sagitta, len(places))
@@ -158,10 +185,11 @@ def _rings(surface: Surface, reach: float, tolerance_m: float, turn: float) -> l
             if arc < _SHORT * width and counts[0] % 2 == 0 and counts[0] > 2 * _FEWEST_AT_TOP
             else counts[0],
         )
+    angles, _ = _angles(around, most, turn)
     wide = [1.0 + _OUT * (1.0 - math.cos(math.pi / count)) for count in counts]
 
     def corner(ring: int, k: int) -> Corner:
-        angle = 2.0 * math.pi * (k / counts[ring] + turn / most)
+        angle = float(angles[k * (most // counts[ring])])
         away = places[ring] * wide[ring]
         return x + away * math.cos(angle), y + away * math.sin(angle), float(heights[ring] + base)
 

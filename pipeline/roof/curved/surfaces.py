@@ -8,7 +8,6 @@ of all points (Gauss and Newton; weights of Geman and McClure).
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
 
@@ -21,8 +20,6 @@ _REACHES_M = (1.0, 0.5, 0.25)
 _STEPS, _PATIENCE, _HOPELESS, _STILL = 14, 4, 6.0, 1e-5
 """Most steps; after some, a fit ends whose points scatter by many times what is wanted, or whose parameters rest."""
 _SIGMAS = 3.0
-_STRETCHES = (1.0, 0.7, 1.4)
-"""Heights of the first ellipses, in radii of the circle."""
 _MAD_TO_SIGMA = 1.4826
 _LEAST_SIGMA_M = 0.005
 _TINY = 1e-9
@@ -70,9 +67,9 @@ def fitted_surfaces(points: FloatArray, planes: Sequence[Plane], labels: LabelAr
         one = _fitted(kind, points, distances, first, most_m)
         found.extend([one] if one is not None else [])
         if kind is RoofType.BARREL:
-            starts = _ellipses(first if one is None else np.array(one.parameters))
+            starts = _ellipses(known, first if one is None else np.array(one.parameters))
             ellipses = (_fitted(kind, points, distances, start, most_m) for start in starts)
-            found.extend(itertools.islice(filter(None, ellipses), 1))
+            found.extend(sorted(filter(None, ellipses), key=lambda ellipse: ellipse.sigma_m)[:1])
     return found
 
 
@@ -115,11 +112,17 @@ def _first_barrel(points: FloatArray, slopes: FloatArray, weights: FloatArray) -
     return np.array([azimuth, at, base, math.sqrt(square)]) if square > 0.0 else None
 
 
-def _ellipses(circle: FloatArray) -> Iterator[FloatArray]:
-    """Beginnings of ellipses: as high as a circle, lower, and higher, with the same crown."""
+def _ellipses(points: FloatArray, circle: FloatArray) -> Iterator[FloatArray]:
+    """Beginnings of ellipses: that of least squares of v^2 = 2 v v0 - k z^2 + 2 k z z0 + d, and a circle."""
     azimuth, at, base, radius = circle.tolist()
-    for stretch in _STRETCHES:
-        yield np.array([azimuth, at, base + (1.0 - stretch) * radius, radius, stretch * radius])
+    v, z = points[:, 1] * math.cos(azimuth) - points[:, 0] * math.sin(azimuth), points[:, 2]
+    solved = _solved(np.column_stack([2.0 * v, -z * z, 2.0 * z, np.ones(len(v))]), v * v)
+    if solved is not None and solved[1] > 0.0:
+        middle, k, raised, rest = solved.tolist()
+        square = rest + middle * middle + raised * raised / k
+        if square > 0.0:
+            yield np.array([azimuth, middle, raised / k, math.sqrt(square), math.sqrt(square / k)])
+    yield np.array([azimuth, at, base, radius, radius])
 
 
 def _first_cone(points: FloatArray, slopes: FloatArray, weights: FloatArray) -> FloatArray | None:
