@@ -191,7 +191,7 @@ def plane_rows(result: BuildingResult, context: RecordContext) -> list[dict[str,
                 "area_m2": round(plan_area / math.cos(math.radians(plane.slope_deg)), 3),
                 "n_points": plane.n_points,
                 "rmse_m": _or_none(plane.rmse_m),
-                "extrapolated": plane.n_points == 0,
+                "extrapolated": plane.n_points == 0 and not result.roof_type.is_curved,
             }
         )
     return rows

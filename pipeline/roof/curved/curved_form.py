@@ -55,18 +55,13 @@ def curved_forms(
     near = roof.points - shift
     moved = [dataclasses.replace(one, c=one.c + one.a * shift[0] + one.b * shift[1] - shift[2]) for one in planes]
     sigma_m, of_planes_m = _about_planes(near, moved, roof)
-    found = [
-        (_cost(one.distances_m, one.sigma_m, len(one.parameters) + _KIND_TERMS), k, one)
-        for k, one in enumerate(fitted_surfaces(near, moved, roof.labels, _AS_NOISY * sigma_m))
-        if _is_whole(one, near, outline_mm, shift)
-    ]
-    # all are counted in the noise of the best one: a better fit is a shorter description
+    fitted = fitted_surfaces(near, moved, roof.labels, _AS_NOISY * sigma_m)
+    found = [one for one in fitted if _is_whole(one, near, outline_mm, shift)]
     if not found:
         return
-    noise_m = min(one.sigma_m for _, _, one in found)
-    cost, _, surface = min(
-        (_cost(one.distances_m, noise_m, len(one.parameters) + _KIND_TERMS), k, one) for _, k, one in found
-    )
+    noise_m = min(one.sigma_m for one in found)  # all are counted in the noise of the best one
+    costs = [_cost(one.distances_m, noise_m, len(one.parameters) + _KIND_TERMS) for one in found]
+    cost, surface = min(costs), found[costs.index(min(costs))]
     margin = _cost(of_planes_m, noise_m, _PLANE_TERMS * len(planes)) - cost
     if margin <= 0.0:
         return
@@ -75,7 +70,7 @@ def curved_forms(
     tolerance_m = min(max(wanted_m, _LEAST_TOLERANCE_M), _MOST_TOLERANCE_M)
     for turn in _TURNS:
         words = f"{_words(surface)}; facets within {tolerance_m:.3f} m"
-        yield NamedForm(CURVED, partial(_faces, surface, outline_mm, shift, tolerance_m, turn), words)
+        yield NamedForm(CURVED, partial(_faces, surface, outline_mm, near, shift, tolerance_m, turn), words)
 
 
 def _about_planes(near: FloatArray, planes: Sequence[Plane], roof: RoofPoints) -> tuple[float, FloatArray]:
@@ -136,7 +131,12 @@ def _words(surface: Surface) -> str:
 
 
 def _faces(
-    surface: Surface, outline_mm: MultiPolygon, shift: FloatArray, tolerance_m: float, turn: float
+    surface: Surface,
+    outline_mm: MultiPolygon,
+    near: FloatArray,
+    shift: FloatArray,
+    tolerance_m: float,
+    turn: float,
 ) -> RoofPartition:
     """The facets within an outline."""
     dx, dy, dz = shift.tolist()
@@ -145,12 +145,16 @@ def _faces(
     pieces, of_piece = cut_to(moved_mm, facets)
     if not pieces:
         raise BuildingError(Reason.NO_PARTITION, "no facet lies in the outline")
-    used = sorted(set(of_piece))
-    number = {facet: k for k, facet in enumerate(used)}
+    used, labels = np.unique(of_piece, return_inverse=True)
+    places = shapely.points(near[:, :2] * 1e3)
+    piece, point = shapely.STRtree(places).query(pieces, predicate="contains")
     planes = []
-    for facet in used:
+    for k, facet in enumerate(used.tolist()):
         a, b, c = facets[facet].plane
-        planes.append(Plane(a=a, b=b, c=c + dz - a * dx - b * dy, n_points=0, rmse_m=surface.sigma_m))
+        x, y, z = near[point[labels[piece] == k]].T
+        away = z - a * x - b * y - c
+        rmse_m = math.sqrt(float(np.mean(away * away))) if len(away) else surface.sigma_m
+        planes.append(Plane(a=a, b=b, c=c + dz - a * dx - b * dy, n_points=len(away), rmse_m=rmse_m))
     moved = shapely.transform(pieces, lambda xy: xy + shift[:2] * 1e3)
-    labels = np.array([number[facet] for facet in of_piece], np.int32)
-    return RoofPartition(polygons=tuple(moved), labels=labels, planes=tuple(planes), roof_type=surface.kind)
+    partition = RoofPartition(polygons=tuple(moved), labels=labels.astype(np.int32), planes=tuple(planes))
+    return dataclasses.replace(partition, roof_type=surface.kind)

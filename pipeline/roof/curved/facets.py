@@ -78,7 +78,7 @@ def _angles(around: FloatArray, count: int, turn: float) -> tuple[FloatArray, fl
     """The angles (count + 1,) between sectors, through corners of an outline that they nearly meet; reach of them."""
     away = np.hypot(around[:, 0], around[:, 1])
     step = 2.0 * math.pi / count
-    angles = (np.arange(count) + turn) * step
+    angles: FloatArray = (np.arange(count) + turn) * step
     corners = np.arctan2(around[:, 1], around[:, 0]) % (2.0 * math.pi)
     corners = np.where(corners < (turn - 0.5) * step, corners + 2.0 * math.pi, corners)
     angles = _snapped(angles, corners, np.minimum(_NEAR_M / np.maximum(away, _NEAR_M), 0.3 * step))
@@ -224,4 +224,6 @@ def cut_to(outline_mm: shapely.MultiPolygon, facets: Sequence[Facet]) -> tuple[l
     tree = shapely.STRtree(areas)
     kept = shapely.contains(outline_mm, inner)
     pieces, inner = pieces[kept], inner[kept]
-    return list(pieces), [int(tree.nearest(place)) for place in inner]
+    owners = tree.nearest(inner)
+    order = sorted(range(len(pieces)), key=lambda k: (int(owners[k]), inner[k].x, inner[k].y))
+    return [pieces[k] for k in order], [int(owners[k]) for k in order]
