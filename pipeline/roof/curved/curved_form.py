@@ -96,6 +96,8 @@ def _is_whole(surface: Surface, near: FloatArray, outline_mm: MultiPolygon, shif
     if np.mean(on_it) < _LEAST_ON_IT:
         return False
     points = near[on_it]
+    if surface.kind is not RoofType.CONE and np.median(points[:, 2]) <= surface.parameters[2]:
+        return False  # it hangs
     if surface.kind is RoofType.BARREL:
         azimuth, at, base, *_ = surface.parameters
         width, height = surface.axes

@@ -116,6 +116,10 @@ def waves(x: FloatArray, y: FloatArray) -> FloatArray:
     return 6.0 + 0.05 * np.sin(x) + 0.0 * y
 
 
+def hanging(x: FloatArray, y: FloatArray) -> FloatArray:
+    return 16.0 - np.sqrt(100.0 - y**2) + 0.0 * x
+
+
 def nearly_level(x: FloatArray, y: FloatArray) -> FloatArray:
     return 6.0 - 0.002 * x**2 + 0.0 * y
 
@@ -128,6 +132,7 @@ PLANES = {
     "mansard": mansard,
     "waves": waves,
     "nearly level": nearly_level,
+    "hanging": hanging,
     "hexagonal pyramid": pyramid(6, 0.8),
     "octagonal pyramid": pyramid(8, 0.8),
 }
