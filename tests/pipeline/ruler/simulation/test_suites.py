@@ -44,7 +44,15 @@ def test_an_unknown_split_and_an_impossible_draw_are_both_reported() -> None:
 
 def test_every_roof_shape_is_a_suite_beside_the_scenes() -> None:
     scenes = {"suburb", "town", "cube", "hofmann310", "sweep", "city"}
-    scenes |= {"low_buildings", "bridges_and_vans", "wide_halls", "outline_shapes", "broken_slopes", "trust"}
+    scenes |= {
+        "low_buildings",
+        "bridges_and_vans",
+        "wide_halls",
+        "outline_shapes",
+        "broken_slopes",
+        "curved_roofs",
+        "trust",
+    }
     assert scenes | {str(shape) for shape in RoofShape} == set(SUITES)
 
 
