@@ -20,6 +20,9 @@ USUAL_NOISE_M, MOST_NOISE_M = 0.1, 0.15
 """The weights are fitted to surveys whose ground is at most so noisy as the first. What it has beyond that, up to the
 second, does not count as scatter: noisier ground has plants on it, and crowns stand around it."""
 
+_OF_CURVE = 5
+"""Planes as which a curved surface counts, the fewest that show one: crowns resemble domes."""
+
 PER_LOG_ROUGH = -0.69
 """Log-odds of a rejected object per e-fold of its rough places: the more there are, the surer it is not a roof."""
 AT_NO_ROUGH = -1.77
@@ -49,7 +52,8 @@ def confidence_of(record: BuildingResult) -> float:
     """The same of a delivered model, and of the model that a block replaced; nan for other blocks, or without one."""
     if record.footprint is None or not record.planes or not math.isnan(record.replaced_confidence):
         return record.replaced_confidence
-    plane_area_m2 = record.footprint.area / (1 if record.roof_type.is_curved else len(record.planes))
+    count = len(record.planes)
+    plane_area_m2 = record.footprint.area / (min(count, _OF_CURVE) if record.roof_type.is_curved else count)
     return detection_confidence(record.quality.noise_m, plane_area_m2, record.ground_noise_m)
 
 

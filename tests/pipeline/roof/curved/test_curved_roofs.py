@@ -254,3 +254,13 @@ def test_a_curve_is_one_surface_for_the_figures_that_count_faces() -> None:
     assert len(result.faces) > 50
     planar = dataclasses.replace(result, roof_type=RoofType.COMBINATION)
     assert confidence_of(result) > 0.9 > confidence_of(planar)
+
+
+def test_a_small_dome_about_which_points_scatter_as_about_a_crown_is_no_certain_building() -> None:
+    dome = modelled(sphere(6.3), ROUND)
+    crown = dataclasses.replace(
+        dome,
+        footprint=shapely.Point(0.0, 0.0).buffer(3.5),
+        quality=dataclasses.replace(dome.quality, noise_m=0.115),
+    )
+    assert confidence_of(crown) < 0.5 < confidence_of(dome)
