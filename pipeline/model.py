@@ -120,6 +120,8 @@ class FaceKind(StrEnum):
     GROUND = "ground"
     CEILING = "ceiling"
     """The underside of an overhang."""
+    CLOSURE = "closure"
+    """The foot of a box on the roof."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -645,6 +647,8 @@ class BuildingResult:
     """Models at the coarser requested levels of detail, the finest first; none beside a fallback block."""
     overhangs: Overhangs | None = None
     """The model in LoD2.3 beside that of the record; None unless the settings request it, and without a model."""
+    boxes: tuple[Solid, ...] | None = None
+    """Closed boxes of what stands on the roof, in LoD2.2; None unless the settings request them."""
 
     def doubted(self, doubt: Doubt) -> BuildingResult:
         """The same model as a doubtful one."""

@@ -51,7 +51,7 @@ EXTRAS: Mapping[str, str] = {
     "with_enclosed_planes": "guides.enclosed_planes:with_enclosed_planes",
     # lods
     "FacadePoints": "lods.facades:FacadePoints",
-    "lower_lods": "lods.lower_lods:lower_lods",
+    "at_levels": "lods.levels:at_levels",
     "overhangs_of": "lods.overhang_model:overhangs_of",
     "walls_beneath": "lods.facades:walls_beneath",
     # octree
@@ -69,6 +69,8 @@ EXTRAS: Mapping[str, str] = {
     "ObjectStorage": "remote.object_storage:ObjectStorage",
     "RemoteFile": "remote.remote_file:RemoteFile",
     "files_at": "remote.remote_inputs:files_at",
+    # superstructures
+    "boxes_of": "superstructures.boxes:boxes_of",
     # templates
     "fit_templates": "templates.fitting:fit_templates",
     "margin_of_templates": "templates.fitting:margin_of_templates",

@@ -2,34 +2,20 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from pipeline.building.drawing import Building, DrawnModel
 from pipeline.errors import BuildingError
 from pipeline.methods import OVERHANGS
-from pipeline.model import (
-    BuildingResult,
-    Candidate,
-    Decision,
-    DecisionKind,
-    HeightSource,
-    LodModel,
-    Outcome,
-    Reason,
-    RoofFace,
-    Status,
-)
+from pipeline.model import BuildingResult, Candidate, HeightSource, Reason, RoofFace, Status
 from pipeline.quality.model_quality import drawn_outline_sigma_m, model_quality
-from pipeline.quality.validity import check_solid
 from pipeline.registry import extra
 from pipeline.roof.footprint import hull_of_points
 from pipeline.roof.plan import wall_outline, walls_of
 from pipeline.roof.roof_type import roof_type
-from pipeline.roof.solid import LodParts, renumbered, united
+from pipeline.roof.solid import renumbered, united
 from pipeline.terrain.roof_patches import has_directions
 
 
@@ -73,6 +59,9 @@ def record_of(
     overhangs = None
     if OVERHANGS in building.settings.lods:
         overhangs = extra("overhangs_of")(building, model, walls)
+    boxes = None
+    if building.settings.roof.superstructures and model.lod == "2.2":
+        boxes = extra("boxes_of")(building, faces, planes, footprint, quality.noise_m)
     return BuildingResult(
         building_id=candidate.building_id,
         origin=candidate.origin,
@@ -103,6 +92,7 @@ def record_of(
         ground_noise_m=candidate.ground_noise_m,
         walls=wall_outline(walls),
         overhangs=overhangs,
+        boxes=boxes,
         guides=guides,
         decisions=tuple(building.decisions),
     )
@@ -110,41 +100,10 @@ def record_of(
 
 def delivered(building: Building, model: DrawnModel) -> BuildingResult | None:
     """The record of a model at the levels of detail that the settings ask for; None where the finest is not valid."""
-    settings, lods = building.settings, building.settings.record_lods
-    if lods == (model.lod,):
+    if building.settings.record_lods == (model.lod,):
         return record_of(building, model)
-    models = extra("lower_lods")(
-        model, building.roof.points, building.candidate.ground_z_m, settings.roof, lods,
-        lambda solid: not check_solid(solid), building.roof.limit_mm,
-    )  # fmt: skip
-    building.decisions.extend(_levels(lods, models))
-    if not models or models[0].lod != lods[-1]:
-        return None
-    finest, *coarser = models
-    if finest is not model:  # level parts say nothing about the roof's type, and nothing competed with them
-        own_type = record_of(building, model).roof_type
-        model = DrawnModel(lod=finest.lod, parts=finest.parts, planes=finest.planes, roof_type=own_type)
-    return dataclasses.replace(record_of(building, model), coarser=tuple(_lod_model(one) for one in coarser))
-
-
-def _levels(lods: Sequence[str], models: Sequence[LodParts]) -> Iterator[Decision]:
-    """Which of the levels of detail that were asked for were reached, the finest first."""
-    reached = {model.lod: model for model in models}
-    for lod in reversed(lods):
-        faces = [face.plane for part in reached[lod].parts for face in part.faces] if lod in reached else None
-        yield Decision(
-            kind=DecisionKind.LEVEL,
-            name=lod,
-            outcome=Outcome.UNDRAWABLE if faces is None else Outcome.CHOSEN,
-            detail="no form of its solids is valid" if faces is None else "",
-            n_faces=None if faces is None else len(faces),
-            n_planes=None if faces is None else len(set(faces)),
-        )
-
-
-def _lod_model(model: LodParts) -> LodModel:
-    """A coarser model as it is delivered."""
-    return LodModel(lod=model.lod, planes=tuple(model.planes), solids=tuple(part.solid for part in model.parts))
+    result: BuildingResult | None = extra("at_levels")(building, model)
+    return result
 
 
 def failed_building(candidate: Candidate, method: str, reason: Reason, detail: str) -> BuildingResult:

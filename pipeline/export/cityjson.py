@@ -1,6 +1,7 @@
-"""CityJSONSeq 2.0: a line of metadata, then one CityJSONFeature per building, with one BuildingPart per solid.
+"""CityJSONSeq 2.0: a line of metadata, then one CityJSONFeature per building.
 
-Other levels of detail are further geometries of the same parts, each with its `lod`.
+A building has one BuildingPart per solid and one BuildingInstallation per box on its roof. Other levels of detail are
+further geometries of the same parts, each with its `lod`.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.export.obj import part_id
+from pipeline.export.obj import box_id, part_id
 from pipeline.export.solid_geometry import SHAPE_COLUMNS, SURFACES, models_beside
 from pipeline.export.stored_coordinates import SpatialReference, crs_coordinates, decimals, epsg_code
 from pipeline.model import BuildingResult, FaceKind, FloatArray, Plane, Solid
@@ -106,8 +107,8 @@ def json_line(value: Mapping[str, Any]) -> str:
 
 
 def _solids(result: BuildingResult) -> list[Solid]:
-    """The solids of all levels of detail, those of the record first."""
-    return [*result.solids, *(solid for model in models_beside(result) for solid in model.solids)]
+    """The solids of all levels of detail, those of the record first, then boxes on the roof."""
+    return [*result.solids, *(s for model in models_beside(result) for s in model.solids), *(result.boxes or ())]
 
 
 def _feature(
@@ -116,8 +117,9 @@ def _feature(
     """The CityJSONFeature of one building; each solid has its own vertices, each part one solid per level of detail."""
     parts = [part_id(result, part) for part in range(len(result.solids))]
     building: dict[str, Any] = {"type": "Building", "attributes": _attributes(row)}
+    boxes = [box_id(result, number) for number in range(len(result.boxes or ()))]
     if parts:
-        building["children"] = parts
+        building["children"] = [*parts, *boxes]
     objects: dict[str, Any] = {result.building_id: building}
     first = 0
     for name, solid in zip(parts, result.solids, strict=True):
@@ -132,6 +134,10 @@ def _feature(
         for name, solid in zip(parts, model.solids, strict=True):
             objects[name]["geometry"].append(_solid(solid, planes, model.lod, first))
             first += len(solid.vertices)
+    for name, solid in zip(boxes, result.boxes or (), strict=True):
+        geometry = [_solid(solid, (), "2.2", first)]
+        objects[name] = {"type": "BuildingInstallation", "parents": [result.building_id], "geometry": geometry}
+        first += len(solid.vertices)
     return {
         "type": "CityJSONFeature",
         "id": result.building_id,

@@ -152,6 +152,7 @@ BUILDINGS = (
         "like `solid_surfaces`, for LoD2.3, and `OuterCeilingSurface` for the undersides of overhangs",
     ),
     Column("solid_lod23_planes", INT32S, NONE, "like `solid_planes`, for LoD2.3; -1 on undersides too"),
+    Column("boxes", WKB, HORIZONTAL, "boxes of chimneys and roof units, like `solid`; null without any"),
     Column("ground_z", FLOAT64, VERTICAL, "elevation of the floor: the lowest terrain at the outline"),
     Column(
         "ground_source",
@@ -352,6 +353,7 @@ BUILDINGS = (
         "why a model has no solids in LoD2.3, from a closed list; null if it has, and if they are not requested",
         page="../methods/overhangs.md#buildings-without-lod23",
     ),
+    Column("n_boxes", INT32, COUNT, "number of `boxes`; null if they are not requested"),
     Column(
         "guides_followed",
         INT32,

@@ -1,8 +1,8 @@
 """Wavefront OBJ: full coordinates, one `o` per closed solid, groups by the kind of face, one material per roof plane.
 
-The groups are roof, wall, ground, and ceiling for the undersides of overhangs. There is no `mtllib`: a material's name
-says which roof plane a face belongs to (`roof_3` is plane_id 3), and the viewer chooses its colour. Programs make a
-default material of each name.
+The groups are roof, wall, ground, ceiling (undersides of overhangs) and closure (feet of boxes on roofs). There is no
+`mtllib`: a material's name says which roof plane a face belongs to (`roof_3` is plane_id 3), and the viewer chooses its
+colour. Programs make a default material of each name.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from pipeline.export.solid_geometry import model_at
 from pipeline.export.stored_coordinates import SpatialReference, crs_coordinates, decimals
 from pipeline.model import BuildingResult, FaceKind, FloatArray, Solid, SolidFace
 
-_KINDS = (FaceKind.ROOF, FaceKind.WALL, FaceKind.GROUND, FaceKind.CEILING)
+_KINDS = (FaceKind.ROOF, FaceKind.WALL, FaceKind.GROUND, FaceKind.CEILING, FaceKind.CLOSURE)
 
 
 def obj_text(results: Iterable[BuildingResult], reference: SpatialReference, lod: str | None = None) -> str:
@@ -27,8 +27,11 @@ def obj_text(results: Iterable[BuildingResult], reference: SpatialReference, lod
     written = 0
     for result in results:
         model = model_at(result, lod)
-        for part, solid in enumerate(model.solids if model is not None else ()):
-            lines.append(f"o {part_id(result, part)}")
+        solids = [(part_id(result, part), solid) for part, solid in enumerate(model.solids if model else ())]
+        if model and model.lod == "2.2":
+            solids += [(box_id(result, number), solid) for number, solid in enumerate(result.boxes or ())]
+        for name, solid in solids:
+            lines.append(f"o {name}")
             lines.extend(vertex_lines(crs_coordinates(solid.vertices, result.origin, reference), reference))
             lines.extend(_face_lines(solid, written + 1))
             written += len(solid.vertices)
@@ -40,6 +43,11 @@ def part_id(result: BuildingResult, part: int) -> str:
     return f"{result.building_id}-{part}"
 
 
+def box_id(result: BuildingResult, number: int) -> str:
+    """The name of one of the boxes on a building's roof, in OBJ and CityJSON alike."""
+    return f"{result.building_id}-box{number}"
+
+
 def vertex_lines(xyz: FloatArray, reference: SpatialReference) -> list[str]:
     """The `v` lines of coordinates (n, 3) in the units of the CRS."""
     plan, up = decimals(reference.horizontal_unit_m), decimals(reference.vertical_unit_m)
@@ -48,7 +56,7 @@ def vertex_lines(xyz: FloatArray, reference: SpatialReference) -> list[str]:
 
 def _material(face: SolidFace) -> str:
     """The material's name: a roof plane's own, else the kind's."""
-    return f"roof_{face.plane}" if face.kind is FaceKind.ROOF else face.kind.value
+    return f"roof_{face.plane}" if face.plane >= 0 else face.kind.value
 
 
 def _face_lines(solid: Solid, first: int) -> list[str]:

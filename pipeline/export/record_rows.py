@@ -106,6 +106,7 @@ def building_row(result: BuildingResult, context: RecordContext, *, mesh_path: s
         "strip_offset_m": _or_none(result.strip_offset_m),
         "ground_noise_m": _or_none(result.ground_noise_m),
         **_walls(result, context.reference),
+        "n_boxes": None if result.boxes is None else len(result.boxes),
         "guides_followed": None if result.guides is None else result.guides[0],
         "guides_not_followed": None if result.guides is None else result.guides[1],
         "acquired_from": facts.acquired_from,

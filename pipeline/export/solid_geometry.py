@@ -35,7 +35,7 @@ _COARSER_COLUMNS = {
 OVERHANG_COLUMNS = tuple(f"solid_{lod_suffix(OVERHANGS)}{end}" for end in ("", "_parts", "_surfaces", "_planes"))
 """The columns of the solids with overhangs."""
 
-SOLIDS = ("solid", *(names[0] for names in _COARSER_COLUMNS.values()), OVERHANG_COLUMNS[0])
+SOLIDS = ("solid", *(names[0] for names in _COARSER_COLUMNS.values()), OVERHANG_COLUMNS[0], "boxes")
 """The columns of geometry among `SOLID_COLUMNS`."""
 SOLID_COLUMNS = (
     "solid",
@@ -44,6 +44,7 @@ SOLID_COLUMNS = (
     "solid_planes",
     *(name for names in _COARSER_COLUMNS.values() for name in names),
     *OVERHANG_COLUMNS,
+    "boxes",
 )
 """The columns that tell a building's solids."""
 WALL_OUTLINE = "wall_outline"
@@ -55,6 +56,7 @@ SURFACES = {
     FaceKind.WALL: "WallSurface",
     FaceKind.GROUND: "GroundSurface",
     FaceKind.CEILING: "OuterCeilingSurface",
+    FaceKind.CLOSURE: "ClosureSurface",
 }
 """CityGML's names of the kinds of faces."""
 
@@ -82,6 +84,8 @@ def solid_columns(result: BuildingResult, reference: SpatialReference) -> dict[s
     if result.overhangs is not None and result.overhangs.solids:
         values = _columns_of(result.overhangs.solids, result.origin, reference)
         columns.update(zip(OVERHANG_COLUMNS, values, strict=True))
+    if result.boxes:
+        columns["boxes"] = _columns_of(result.boxes, result.origin, reference)[0]
     return columns
 
 

@@ -97,6 +97,9 @@ class RoofSettings(Parameters):
         maximum=1.0,
         added=True,
     )
+    superstructures: bool = parameter(
+        False, "LoD2.2: chimneys and roof units above the roof faces become boxes of their own.", added=True
+    )
     templates_spacing_m: float = parameter(
         0.6,
         "Arranged faces compete with simple roof shapes where points lie at least this far apart.",
