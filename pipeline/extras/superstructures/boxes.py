@@ -21,6 +21,8 @@ from pipeline.roof.solid import solid_parts
 
 _GAP_M = 0.005
 """Between roof and box: both are rounded to 1 mm, and val3dity takes boxes for parts, which must not overlap."""
+_MIN_OVER_M = 0.15
+"""Least height of a box over the highest roof beneath it."""
 _KINDS = {FaceKind.ROOF: FaceKind.CLOSURE, FaceKind.GROUND: FaceKind.ROOF, FaceKind.WALL: FaceKind.WALL}
 """Of a box upside down, and as it stands."""
 
@@ -70,12 +72,16 @@ def box_solid(box: FoundBox, faces: Sequence[RoofFace], planes: Sequence[Plane])
             labels += [face.plane] * len(pieces)
     top_z_m = round(box.top_z_m, 3)
     mirrored = [dataclasses.replace(plane, a=-plane.a, b=-plane.b, c=-plane.c - _GAP_M) for plane in planes]
+    if not polygons:
+        return None
     try:
         solid = _upside_down(polygons, labels, mirrored, top_z_m)
         if any(_is_step(face, solid) for face in solid.faces):
             foot = dataclasses.replace(planes[0], a=0.0, b=0.0, c=_highest_foot(solid))
             solid = _upside_down([rectangle], [0], [foot], top_z_m)
     except BuildingError:
+        return None
+    if top_z_m + _highest_foot(solid) < _MIN_OVER_M:
         return None
     return Solid(
         vertices=solid.vertices * (1.0, 1.0, -1.0) + 0.0,
@@ -101,6 +107,6 @@ def _is_step(face: SolidFace, solid: Solid) -> bool:
 
 
 def _highest_foot(solid: Solid) -> float:
-    """Lowest elevation of the roof of a box upside down: the highest place of its foot."""
+    """Elevation of the highest place of the foot of a box upside down, where it is the lowest of its roof."""
     corners = [k for face in solid.faces if face.kind is FaceKind.ROOF for ring in face.rings for k in ring]
     return float(solid.vertices[corners, 2].min())

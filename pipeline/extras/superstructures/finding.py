@@ -34,11 +34,12 @@ _WIDENED_SPACINGS = 1.0
 """Most that a side grows beyond the outermost points."""
 _MIN_EXTENT_M = 0.15
 """Least extent of the points: rods are narrower."""
-_MIN_SIDE_M = 0.3
-_MAX_ASPECT = 4.0
-"""Parapets and wires are longer."""
-_MAX_SPLIT_SHARE = 0.5
-"""Share of the top whose pulses went on to the roof."""
+_MIN_SIDE_M, _MIN_SIDE_SPACINGS = 0.3, 1.0
+"""A narrower box is not resolved."""
+_MAX_ASPECT, _MAX_SLENDERNESS = 4.0, 6.0
+"""Parapets and wires are longer over their width, masts higher."""
+_MAX_SPLIT_SHARE = 0.8
+"""Share of the top whose pulses went on to the roof: the middle of a chimney stops whole pulses, a wire stops none."""
 _MIN_FILLED_SHARE = 0.5
 """Least share of the points that so dense a survey has on the rectangle."""
 _CORE_SHARE, _MAX_BENEATH_SHARE = 0.6, 0.25
@@ -162,7 +163,9 @@ def _box(
     grown = np.minimum(2.0 * extent / (len(upper) - 1), _WIDENED_SPACINGS * roof.spacing_m)
     low, high = low - grown / 2, high + grown / 2
     sides = high - low
-    if sides.min() < _MIN_SIDE_M or sides.max() > _MAX_ASPECT * sides.min():
+    if sides.min() < max(_MIN_SIDE_M, _MIN_SIDE_SPACINGS * roof.spacing_m):
+        return None
+    if sides.max() > _MAX_ASPECT * sides.min() or top_z - foot_z > _MAX_SLENDERNESS * sides.min():
         return None
     if len(upper) < _MIN_FILLED_SHARE * sides[0] * sides[1] / roof.spacing_m**2:
         return None
@@ -175,10 +178,6 @@ def _box(
     if beneath.sum() > _MAX_BENEATH_SHARE * inside.sum():
         return None
     corners = np.array([(low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1])]) @ frame
-    around = np.vstack([corners, corners.mean(axis=0)])
-    roof_z = roof.surface.elevation(np.ascontiguousarray(around[:, 0]), np.ascontiguousarray(around[:, 1]))
-    if math.isnan(roof_z[-1]) or not top_z - np.nanmax(roof_z) >= roof.least_m / 2:
-        return None
     return FoundBox(corners=corners, top_z_m=top_z)
 
 
