@@ -48,7 +48,8 @@ class TrueSuperstructure:
     """In plan, scene frame."""
     sides_m: tuple[float, float]
     """Short and long side."""
-    building: Building
+    top_z_m: float
+    """Elevation of its roof over its middle, scene frame."""
 
 
 def true_superstructures(buildings: tuple[Building, ...]) -> Iterator[TrueSuperstructure]:
@@ -57,9 +58,22 @@ def true_superstructures(buildings: tuple[Building, ...]) -> Iterator[TrueSupers
         for one in building.dimensions.additions:
             corners = turned(np.array(plan_rectangle(one)), building.x, building.y, building.azimuth_deg)
             sides = sorted((one.length_m, one.width_m))
+            outline = shapely.Polygon(corners)
             yield TrueSuperstructure(
-                kind=one.kind, outline=shapely.Polygon(corners), sides_m=(sides[0], sides[1]), building=building
+                kind=one.kind,
+                outline=outline,
+                sides_m=(sides[0], sides[1]),
+                top_z_m=_roof_z_m(building, outline.centroid),
             )
+
+
+def _roof_z_m(building: Building, place: shapely.Point) -> float:
+    """Elevation of a roof at a place."""
+    return max(
+        plane.a * place.x + plane.b * place.y + plane.c
+        for plane, face in zip(building.planes, building.roof_polygons(), strict=True)
+        if shapely.force_2d(face).intersects(place)
+    )
 
 
 def _with_additions(shape: RoofShape, size: RoofDimensions, random: np.random.Generator) -> RoofDimensions:
