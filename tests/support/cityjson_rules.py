@@ -21,7 +21,7 @@ def _object(optional: dict[str, Schema] | None = None, **required: Schema) -> Sc
 _TEXT, _NUMBER, _INTEGER = ({"type": name} for name in ("string", "number", "integer"))
 _NUMBERS = _array(_NUMBER, 3, 3)
 _RINGS = _array(_array({"type": "integer", "minimum": 0}, 3), 1)
-_SURFACES = ["RoofSurface", "WallSurface", "GroundSurface", "OuterCeilingSurface"]
+_SURFACES = ["RoofSurface", "WallSurface", "GroundSurface", "OuterCeilingSurface", "ClosureSurface"]
 _SURFACE = _object(type={"enum": _SURFACES}) | {"additionalProperties": True}
 _SOLID = _object(
     type={"const": "Solid"},
@@ -30,7 +30,9 @@ _SOLID = _object(
     semantics=_object(surfaces=_array(_SURFACE), values=_array(_array(_INTEGER))),
 )
 _BUILDING = _object({"attributes": {"type": "object"}, "children": _array(_TEXT, 1)}, type={"const": "Building"})
-_PART = _object(type={"const": "BuildingPart"}, parents=_array(_TEXT, 1, 1), geometry=_array(_SOLID, 1))
+_PART = _object(
+    type={"enum": ["BuildingPart", "BuildingInstallation"]}, parents=_array(_TEXT, 1, 1), geometry=_array(_SOLID, 1)
+)
 _TRIANGLE = _array(_array({"type": "integer", "minimum": 0}, 3, 3), 1, 1)
 _TRIANGLES = _object(
     type={"const": "CompositeSurface"}, lod=_TEXT | {"pattern": r"^[0-3](\.[0-3])?$"}, boundaries=_array(_TRIANGLE, 1)

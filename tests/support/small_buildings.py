@@ -10,6 +10,8 @@ from shapely import Polygon, unary_union
 
 from pipeline.export.record_rows import RecordContext, RejectedObject
 from pipeline.extras.lods.overhangs import overhanging_solids
+from pipeline.extras.superstructures.boxes import box_solid
+from pipeline.extras.superstructures.finding import FoundBox
 from pipeline.model import (
     BuildingResult,
     FaceKind,
@@ -190,6 +192,17 @@ def overhung(building_id: str = "overhung") -> BuildingResult:
     walls_mm = shapely.MultiPolygon([shapely.box(500, 500, 9500, 7500)])
     solids = overhanging_solids([part], result.planes, walls_mm, 0.2, 0.1, lambda solid: not check_solid(solid))
     return dataclasses.replace(result, overhangs=Overhangs(solids=tuple(solids), source=OverhangSource.SEEN))
+
+
+def boxed(building_id: str = "boxed") -> BuildingResult:
+    """The gable with two boxes on its roof, one of them across the ridge."""
+    result = building(building_id, gable_solid())
+    places = (2.0, 1.0, 2.7, 1.8), (6.0, 3.5, 7.0, 4.5)
+    found = [
+        FoundBox(corners=np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)]), top_z_m=9.0) for x0, y0, x1, y1 in places
+    ]
+    solids = [box_solid(box, result.faces, result.planes) for box in found]
+    return dataclasses.replace(result, boxes=tuple(solid for solid in solids if solid is not None))
 
 
 def levelled(building_id: str = "levelled") -> BuildingResult:

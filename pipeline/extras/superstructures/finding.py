@@ -26,6 +26,8 @@ _LEVEL_M, _LEVEL_SIGMAS = 0.1, 6.0
 """Depth of a level top: least to greatest of many points with noise."""
 _MAX_ABOVE_SHARE = 0.1
 """Share of a group that may be above its top: a cowl, an outlier."""
+_MIN_LEVEL_SHARE = 0.4
+"""Least share of a level top in the upper half: a chimney's other points are those of pulses that met its edge."""
 _TOP_QUANTILE = 0.7
 """Of a level top some points are of pulses that met its edge."""
 _LINK_SPACINGS, _MIN_LINK_M = 1.5, 0.3
@@ -153,6 +155,8 @@ def _box(
     top_z = float(np.quantile(points[on_top, 2], _TOP_QUANTILE))
     foot_z = top_z - float(np.median(residuals[on_top]))
     upper = group[z >= (top_z + foot_z) / 2]
+    if len(on_top) < _MIN_LEVEL_SHARE * len(upper):
+        return None
     along = _direction(points[on_top, :2].mean(axis=0), roof)
     frame = np.array([along, (-along[1], along[0])])
     local = points[:, :2] @ frame.T

@@ -28,7 +28,7 @@ from pipeline.export.tile import write_tile
 from pipeline.extras.publish.cityjson_file import city_of
 
 CRSES = ["compound", "feet and metres", "US feet", "unknown"]
-BUILT = (small.gable, small.courtyard, small.two_parts, small.failed, small.pent, small.levelled)
+BUILT = (small.gable, small.courtyard, small.two_parts, small.failed, small.pent, small.levelled, small.boxed)
 SCHEMAS = "GABLEWORK_CITYJSON_SCHEMAS"
 """Names a folder with the schema files of CityJSON 2.0 as its maintainers publish them."""
 
@@ -76,7 +76,7 @@ def test_integer_vertices_give_back_the_coordinates(contexts: Contexts, crs: str
     built = {build().building_id: build() for build in BUILT}
     for feature in features:
         result = built[feature["id"]]
-        solids = [*result.solids, *(solid for model in result.coarser for solid in model.solids)]
+        solids = [*result.solids, *(solid for model in result.coarser for solid in model.solids), *(result.boxes or ())]
         xyz = (
             np.array(feature["vertices"]).reshape(-1, 3) * first["transform"]["scale"] + first["transform"]["translate"]
         )
@@ -206,7 +206,8 @@ def test_cjio_reads_the_sequence_as_one_model(contexts: Contexts, crs: str, tmp_
     model = json.loads((tmp_path / "one.city.json").read_text())
     names = {build().building_id for build in BUILT}
     parts = {"gable-0", "courtyard-0", "two_parts-0", "two_parts-1", "pent-0", "levelled-0", "levelled-1"}
-    assert set(model["CityObjects"]) == names | parts
+    boxed = {"boxed-0", "boxed-box0", "boxed-box1"}
+    assert set(model["CityObjects"]) == names | parts | boxed
     first = sequence(contexts[crs])[0]
     assert model["metadata"].get("referenceSystem") == first["metadata"].get("referenceSystem")
     assert model["metadata"]["geographicalExtent"] == pytest.approx(first["metadata"]["geographicalExtent"], abs=1e-3)
@@ -249,3 +250,17 @@ def test_one_file_is_read_by_cjio(contexts: Contexts, tmp_path: Path) -> None:
 def test_features_without_metadata_are_refused(lines: list[str]) -> None:
     with pytest.raises(ValueError, match="metadata"):
         city_of(lines)
+
+
+def test_boxes_on_a_roof_are_installations_beside_the_parts(contexts: Contexts) -> None:
+    _, feature = sequence(contexts["compound"], [small.boxed])
+    objects = feature["CityObjects"]
+    assert objects["boxed"]["children"] == ["boxed-0", "boxed-box0", "boxed-box1"]
+    assert objects["boxed"]["attributes"]["n_boxes"] == 2
+    for name in ("boxed-box0", "boxed-box1"):
+        assert objects[name]["type"] == "BuildingInstallation"
+        (solid,) = objects[name]["geometry"]
+        assert solid["lod"] == "2.2"
+        kinds = [surface["type"] for surface in solid["semantics"]["surfaces"]]
+        assert sorted(kinds) == ["ClosureSurface", "RoofSurface", "WallSurface"]
+        assert "plane_id" not in solid["semantics"]["surfaces"][kinds.index("RoofSurface")]

@@ -126,3 +126,16 @@ def test_a_coarser_level_takes_the_place_of_the_records_own_and_a_fallback_block
     assert tops[None] == {"levelled-0": 6.0, "levelled-1": 3.0, "courtyard-0": 9.0, "gable-0": 6.0}
     assert tops["1.3"] == {"levelled-0": 4.75, "levelled-1": 3.0, "courtyard-0": 9.0}
     assert tops["1.2"] == {"levelled-0": 4.5, "levelled-1": 4.5, "courtyard-0": 9.0}
+
+
+def test_boxes_on_a_roof_are_objects_of_their_own_in_lod22_alone(contexts: Contexts) -> None:
+    reference = contexts["compound"].reference
+    _, (building, *boxes) = read_obj(obj_text([small.boxed()], reference))
+    assert [building.name, *(box.name for box in boxes)] == ["boxed-0", "boxed-box0", "boxed-box1"]
+    for box in boxes:
+        assert_closed(numbers for _, _, numbers in box.faces)
+        assert {(group, material) for group, material, _ in box.faces} == {
+            (name, name) for name in ("roof", "wall", "closure")
+        }
+    coarse = dataclasses.replace(small.boxed(), lod="1.2")
+    assert len(read_obj(obj_text([coarse], reference))[1]) == 1
