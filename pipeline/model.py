@@ -460,7 +460,7 @@ class LodModel:
     """A building's model at a coarser level of detail than that of its record."""
 
     lod: str
-    """1.2 or 1.3."""
+    """1.2, 1.3 or 2.0."""
     planes: tuple[Plane, ...]
     """The horizontal planes that the roofs of the solids number."""
     solids: tuple[Solid, ...]

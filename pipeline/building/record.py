@@ -48,7 +48,7 @@ def record_of(
         solids,
         spacing_m=roof.spacing_m,
         outline_sigma_m=0.0 if candidate.footprint is not None else drawn_outline_sigma_m(footprint, len(roof.points)),
-        is_planar=model.lod == "2.2",
+        is_planar=model.lod >= "2",
         bic_margin=model.bic_margin,
     )
     if model.lod == "2.2" and has_directions(np.reshape([plane.normal for plane in planes], (-1, 3))):

@@ -130,7 +130,7 @@ def _feature(
         }
         first += len(solid.vertices)
     for model in models_beside(result):
-        planes = result.planes if model.lod > result.lod else ()
+        planes = result.planes if model.lod >= "2" else ()
         for name, solid in zip(parts, model.solids, strict=True):
             objects[name]["geometry"].append(_solid(solid, planes, model.lod, first))
             first += len(solid.vertices)

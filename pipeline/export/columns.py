@@ -136,6 +136,9 @@ BUILDINGS = (
     Column("solid_lod13", WKB, HORIZONTAL, "the solids in LoD1.3, like `solid_lod12`"),
     Column("solid_lod13_parts", INT32S, NONE, "like `solid_parts`, for LoD1.3"),
     Column("solid_lod13_surfaces", TEXTS, NONE, "like `solid_surfaces`, for LoD1.3"),
+    Column("solid_lod20", WKB, HORIZONTAL, "the solids in LoD2.0, like `solid_lod12`"),
+    Column("solid_lod20_parts", INT32S, NONE, "like `solid_parts`, for LoD2.0"),
+    Column("solid_lod20_surfaces", TEXTS, NONE, "like `solid_surfaces`, for LoD2.0"),
     Column(
         "solid_lod23",
         WKB,

@@ -16,7 +16,7 @@ from pipeline.model import BuildingResult, FaceKind, LodModel, Solid
 
 OVERHANGS = "2.3"
 """The level of detail with overhangs, beside the record's model."""
-COARSER_LODS = ("1.2", "1.3")
+COARSER_LODS = ("1.2", "1.3", "2.0")
 """Levels of detail that have columns and files of their own where a finer one is modelled too."""
 
 

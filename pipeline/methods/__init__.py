@@ -15,8 +15,8 @@ from pipeline.roof.roof_settings import ArrangementSettings, GuideSettings, Roof
 if TYPE_CHECKING:
     from pipeline.model import PreparedCloud, Segmentation
 
-LODS = ("1.2", "1.3", "2.2")
-"""Levels of detail (Biljecki, Ledoux and Stoter 2016): one block, level parts, the roof faces themselves."""
+LODS = ("1.2", "1.3", "2.0", "2.2")
+"""Levels of detail (Biljecki, Ledoux and Stoter 2016): one block, level parts, the main roof, all roof faces."""
 OVERHANGS = "2.3"
 """The level of detail with overhangs, always beside 2.2: where there are none, or they cannot be drawn, it is empty."""
 PRESETS = ("robust", "faithful")

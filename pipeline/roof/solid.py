@@ -40,7 +40,7 @@ class LodParts:
     """A building at one level of detail."""
 
     lod: str
-    """1.2, 1.3 or 2.2."""
+    """1.2, 1.3, 2.0 or 2.2."""
     parts: list[SolidPart]
     """Its separate parts."""
     planes: list[Plane]

@@ -38,7 +38,10 @@ NOT_CONTENT = frozenset(
 """Columns that may differ between runs with equal results (by tiling, names of settings, or the version), and those
 that say where figures come from: the figures themselves and the reasons count."""
 ADDED = frozenset(
-    {*OVERHANG_COLUMNS, "overhang_source", "lod23_reason", "boxes", "n_boxes", "guides_followed", "guides_not_followed"}
+    {
+        *("solid_lod20", "solid_lod20_parts", "solid_lod20_surfaces", "boxes", "n_boxes"),
+        *(*OVERHANG_COLUMNS, "overhang_source", "lod23_reason", "guides_followed", "guides_not_followed"),
+    }
 )
 """Columns that only options fill which were added later: they count in rows that have a value there."""
 FIGURES_ONLY = "reason_detail"

@@ -223,7 +223,7 @@ def building(
         Query(alias="f", description="Overrides the header Accept."),
     ] = None,
     lod: Annotated[
-        Literal["1.2", "1.3", "2.2", "2.3"] | None,
+        Literal["1.2", "1.3", "2.0", "2.2", "2.3"] | None,
         Query(description="Level of detail of an OBJ or GLB, one that the job made; default that of the record."),
     ] = None,
     crs: _Coordinates = None,

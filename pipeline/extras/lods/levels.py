@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 from pipeline.building.drawing import Building, DrawnModel
 from pipeline.building.record import record_of
 from pipeline.extras.lods.lower_lods import lower_lods
 from pipeline.model import BuildingResult, Decision, DecisionKind, LodModel, Outcome
 from pipeline.quality.validity import check_solid
-from pipeline.roof.solid import LodParts
+from pipeline.roof.solid import LodParts, renumbered
 
 
 def at_levels(building: Building, model: DrawnModel) -> BuildingResult | None:
@@ -32,7 +32,10 @@ def at_levels(building: Building, model: DrawnModel) -> BuildingResult | None:
     if finest is not model:  # level parts say nothing about the roof's type, and nothing competed with them
         own_type = record_of(building, model).roof_type
         model = DrawnModel(lod=finest.lod, parts=finest.parts, planes=finest.planes, roof_type=own_type)
-    return dataclasses.replace(record_of(building, model), coarser=tuple(_lod_model(one) for one in coarser))
+    used = sorted({face.plane for part in model.parts for face in part.faces})
+    number = {plane: k for k, plane in enumerate(used)}
+    delivered = tuple(_lod_model(one, number) for one in coarser)
+    return dataclasses.replace(record_of(building, model), coarser=delivered)
 
 
 def _levels(lods: Sequence[str], models: Sequence[LodParts]) -> Iterator[Decision]:
@@ -50,6 +53,10 @@ def _levels(lods: Sequence[str], models: Sequence[LodParts]) -> Iterator[Decisio
         )
 
 
-def _lod_model(model: LodParts) -> LodModel:
-    """A coarser model as it is delivered."""
-    return LodModel(lod=model.lod, planes=tuple(model.planes), solids=tuple(part.solid for part in model.parts))
+def _lod_model(model: LodParts, number: Mapping[int, int]) -> LodModel:
+    """A coarser model as it is delivered; `number` is that of each plane in the record, which LoD2.0 shares."""
+    solids, planes = tuple(part.solid for part in model.parts), tuple(model.planes)
+    if model.lod == "2.0":
+        solids = tuple(renumbered(solid, number) for solid in solids)
+        planes = tuple(model.planes[plane] for plane in number)
+    return LodModel(lod=model.lod, planes=planes, solids=solids)

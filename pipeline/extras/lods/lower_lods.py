@@ -1,8 +1,8 @@
-"""LoD1.2 and LoD1.3 from the roof faces of LoD2.2: level parts over the same outline, walls between them.
+"""LoD1.2, LoD1.3 and LoD2.0 from the roof faces of LoD2.2, over the same outline.
 
 LoD1.3 unites roof faces with no step, or a low one, between them, and gives each level part the height at a percentile
 of its points; LoD1.2 is one such part (Biljecki, Ledoux and Stoter 2016, An improved LOD specification for 3D building
-models). Every level part consists of existing roof faces: nothing is cut again.
+models). LoD2.0 is the main roof alone. Every part consists of existing roof faces: nothing is cut again.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import shapely
 from shapely import MultiPolygon
 
 from pipeline.errors import BuildingError
+from pipeline.extras.lods.main_roof import main_planes
 from pipeline.model import FloatArray, Plane, RoofFace, Solid
 from pipeline.roof.block import block_plane
 from pipeline.roof.footprint import polygons_of
@@ -61,12 +62,13 @@ def lower_lods(
     ground_z_m : float
         Elevation of the floor, local metres.
     lods : sequence of str
-        Some of 1.2, 1.3 and 2.2.
+        Some of 1.2, 1.3, 2.0 and 2.2.
     outline_mm : MultiPolygon, optional
         What the models stay within.
     """
     whole = block_plane(points, ground_z_m, settings.block_height_percentile)
     forms: Mapping[str, Callable[[SolidPart], Iterator[LevelPart]]] = {
+        "2.0": lambda part: main_roof_forms(part, detailed.planes, ground_z_m, outline_mm),
         "1.3": lambda part: level_forms(part, points, whole, ground_z_m, settings, outline_mm),
         "1.2": lambda part: block_forms(part, whole, ground_z_m, outline_mm),
     }
@@ -78,7 +80,9 @@ def lower_lods(
             next((form for form in drawn(part) if is_sound(form.solid_part.solid)), None) for part in detailed.parts
         ]
         found = [form for form in sound if form is not None]
-        if len(found) == len(detailed.parts):
+        if len(found) == len(detailed.parts) and lod == "2.0":
+            models.append(LodParts(lod=lod, parts=[form.solid_part for form in found], planes=detailed.planes))
+        elif len(found) == len(detailed.parts):
             models.append(_numbered_through(lod, found))
     return models
 
@@ -102,6 +106,21 @@ def _numbered_through(lod: str, levels: Sequence[LevelPart]) -> LodParts:
         )
         planes += level.planes
     return LodParts(lod=lod, parts=parts, planes=planes)
+
+
+def main_roof_forms(
+    part: SolidPart, planes: Sequence[Plane], ground_z_m: float, outline_mm: MultiPolygon | None = None
+) -> Iterator[LevelPart]:
+    """Ways to draw one part of a building, with its roof faces of LoD2.2, without what stands on them (LoD2.0)."""
+    borders = {pair: border.length_mm for pair, border in _borders(part.faces).items()}
+    numbers = main_planes(part.faces, planes, borders)
+    if numbers == [face.plane for face in part.faces]:
+        yield LevelPart(solid_part=part, planes=tuple(planes))
+        return
+    regions: list[list[shapely.Polygon]] = [[] for _ in planes]
+    for number, face in zip(numbers, part.faces, strict=True):
+        regions[number].append(_polygon_mm(face))
+    yield from _drawn(regions, planes, ground_z_m, outline_mm)
 
 
 def block_forms(
