@@ -50,17 +50,20 @@ def vertices(result: BuildingResult) -> dict[str, list[bytes]]:
 def test_the_finest_is_the_record_and_the_others_stand_beside_it(method: str) -> None:
     result = modelled(house(), *LODS, method=method)
     assert (result.status, result.lod, result.roof_type) == (Status.OK, "2.2", RoofType.GABLE)
-    assert [model.lod for model in result.coarser] == ["1.3", "1.2"]
-    levels, block = result.coarser
+    assert [model.lod for model in result.coarser] == ["2.0", "1.3", "1.2"]
+    main, levels, block = result.coarser
+    assert main.planes == result.planes
     assert sorted(plane.c for plane in levels.planes) == pytest.approx([2.6, 5.0 + 0.7 * 0.7 * 4.0], abs=0.1)
     assert [len(block.planes), len(block.solids), len(levels.solids)] == [1, 1, 1]
-    assert [check_solid(solid) for model in result.coarser for solid in model.solids] == [(), ()]
+    assert [check_solid(solid) for model in result.coarser for solid in model.solids] == [(), (), ()]
     alone = modelled(house(), "2.2", method=method)
     assert dataclasses.replace(result, coarser=()).rmse_m == alone.rmse_m
     assert vertices(result)["2.2"] == vertices(alone)["2.2"]
 
 
-@pytest.mark.parametrize("asked", [("1.2",), ("1.3",), ("1.2", "1.3"), ("1.3", "2.2"), ("1.2", "2.2")])
+@pytest.mark.parametrize(
+    "asked", [("1.2",), ("1.3",), ("2.0",), ("1.2", "1.3"), ("1.3", "2.0"), ("2.0", "2.2"), ("1.2", "2.2")]
+)
 def test_a_level_is_the_same_whatever_stands_beside_it(asked: tuple[str, ...]) -> None:
     everything = vertices(modelled(house(), *LODS))
     result = modelled(house(), *asked)
@@ -97,5 +100,23 @@ def test_settings_name_the_levels_and_change_the_hash() -> None:
     some = RunSettings.from_mapping({"lods": "1.2,2.2"})
     assert some.building.lods == ("1.2", "2.2")
     assert some.settings_hash != RunSettings.from_mapping({}).settings_hash
-    with pytest.raises(SettingsError, match=r"lods is '2\.2,1\.2': use one of 1\.2, 1\.3, 2\.2, 2\.3, 1\.2,1\.3"):
+    with pytest.raises(SettingsError, match=r"lods is '2\.2,1\.2': use one of 1\.2, 1\.3, 2\.0, 2\.2, 2\.3, 1\.2,1\.3"):
         RunSettings.from_mapping({"lods": "2.2,1.2"})
+
+
+def test_the_main_roof_has_no_dormer_and_its_planes_are_those_of_the_record() -> None:
+    rng = np.random.default_rng(1)
+    x, y = rng.uniform(0, 12, 3_000), rng.uniform(0, 8, 3_000)
+    z = 5.0 + 0.7 * np.minimum(y, 8.0 - y)
+    dormer = (x > 4.0) & (x < 6.5) & (y > 1.0) & (y < 3.0)
+    z = np.where(dormer, 7.4, z) + rng.normal(0, 0.02, 3_000)
+    one = candidate(np.column_stack((x, y, z)), footprint=shapely.box(0, 0, 12, 8))
+    both = modelled(one, "2.0", "2.2")
+    assert len(both.planes) == 3
+    (main,) = both.coarser
+    assert main.planes == both.planes
+    roofs = {face.plane for solid in main.solids for face in solid.faces if face.plane >= 0}
+    assert sorted(both.planes[k].slope_deg for k in roofs) == pytest.approx([35.0, 35.0], abs=0.5)
+    alone = modelled(one, "2.0")
+    assert (alone.lod, len(alone.planes), alone.roof_type) == ("2.0", 2, RoofType.GABLE)
+    assert alone.boxes is None

@@ -19,7 +19,7 @@ from pipeline.export.tile import write_tile
 from pipeline.model import BuildingResult, FaceKind
 
 CRSES = ["compound", "feet and metres", "US feet", "unknown"]
-BUILT = (small.gable, small.courtyard, small.two_parts, small.pent)
+BUILT = (small.gable, small.courtyard, small.two_parts, small.pent, small.boxed)
 SURFACES = {"RoofSurface": FaceKind.ROOF, "WallSurface": FaceKind.WALL, "GroundSurface": FaceKind.GROUND}
 
 

@@ -175,3 +175,38 @@ def test_many_vertices_that_bend_a_line_little_by_little_keep_their_bend() -> No
     after = shapely.LineString([xy for xy in thinned.exterior.coords[:-1] if xy[1] < 800])
     assert len(after.coords) < len(arc) / 2
     assert shapely.hausdorff_distance(before, after, densify=0.1) < 3.0
+
+
+def with_dormers(*dormers: tuple[Polygon, Plane]) -> LodParts:
+    """A gable of 10 m by 8 m, eaves at 5 m and the ridge at 8 m, with faces on it."""
+    planes = [plane(0.0, 0.75, 5.0), plane(0.0, -0.75, 11.0), *(own for _, own in dormers)]
+    over = shapely.union_all([polygon for polygon, _ in dormers])
+    sides = [shapely.box(0, 0, 10, 4) - over, shapely.box(0, 4, 10, 8) - over]
+    return built([*sides, *(polygon for polygon, _ in dormers)], planes)
+
+
+def main_roof(detailed: LodParts) -> LodParts:
+    points = sampled([shapely.box(0, 0, 10, 4)], [level(6.0)])
+    (main,) = lower(detailed, points, ("2.0",))
+    return main
+
+
+def test_a_dormer_of_two_faces_belongs_to_the_face_that_it_stands_on(volume: Volume) -> None:
+    left, right = shapely.box(4, 1, 5, 3), shapely.box(5, 1, 6, 3)
+    detailed = with_dormers((left, plane(0.5, 0.0, 5.3)), (right, plane(-0.5, 0.0, 10.3)))
+    main = main_roof(detailed)
+    assert main.planes == detailed.planes
+    (part,) = main.parts
+    assert sorted(face.plane for face in part.faces) == [0, 1]
+    assert_closed(ring for face in part.solid.faces for ring in face.rings)
+    assert volume(part.solid) == pytest.approx(10 * 8 * 6.5)
+    assert volume(detailed.parts[0].solid) > volume(part.solid) + 2.0
+
+
+def test_a_low_place_a_large_face_and_an_annexe_are_main_roof() -> None:
+    terrace = shapely.box(4, 1, 6, 3), level(4.5)
+    large = shapely.box(1, 0.5, 9, 3.5), level(8.0)
+    for dormer in (terrace, large):
+        assert sorted(face.plane for face in main_roof(with_dormers(dormer)).parts[0].faces) == [0, 1, 2]
+    polygons, planes = house_with_annexe(2.5)
+    assert sorted(face.plane for face in main_roof(built(polygons, planes)).parts[0].faces) == [0, 1, 2]

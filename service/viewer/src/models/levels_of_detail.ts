@@ -3,6 +3,7 @@
 const WORDS: Record<string, string> = {
   "1.2": "one block",
   "1.3": "level parts",
+  "2.0": "main roof",
   "2.2": "roof faces",
   "2.3": "roof faces with overhangs",
 };
