@@ -195,14 +195,15 @@ def overhung(building_id: str = "overhung") -> BuildingResult:
 
 
 def boxed(building_id: str = "boxed") -> BuildingResult:
-    """The gable with two boxes on its roof, one of them across the ridge."""
+    """The gable with two boxes on its roof, one of them across the ridge, and its main roof, which is the same."""
     result = building(building_id, gable_solid())
     places = (2.0, 1.0, 2.7, 1.8), (6.0, 3.5, 7.0, 4.5)
     found = [
         FoundBox(corners=np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)]), top_z_m=9.0) for x0, y0, x1, y1 in places
     ]
     solids = [box_solid(box, result.faces, result.planes) for box in found]
-    return dataclasses.replace(result, boxes=tuple(solid for solid in solids if solid is not None))
+    main = LodModel(lod="2.0", planes=result.planes, solids=result.solids)
+    return dataclasses.replace(result, boxes=tuple(solid for solid in solids if solid is not None), coarser=(main,))
 
 
 def levelled(building_id: str = "levelled") -> BuildingResult:

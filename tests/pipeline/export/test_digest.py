@@ -2,6 +2,7 @@
 
 import dataclasses
 import datetime as dt
+import functools
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -22,7 +23,16 @@ from pipeline.export.record_rows import BUILDINGS, SCHEMAS, CandidateFacts
 from pipeline.export.tile import write_tile
 from pipeline.runtime.digest import ADDED, FIGURES_ONLY, NOT_CONTENT, canonical_rows, run_digest
 
-BUILT = (small.gable, small.courtyard, small.two_parts, small.failed, small.pent, small.levelled, small.overhung)
+BUILT = (
+    small.gable,
+    small.courtyard,
+    small.two_parts,
+    small.failed,
+    small.pent,
+    small.levelled,
+    small.overhung,
+    functools.partial(small.boxed, "with_boxes"),
+)
 
 
 @pytest.fixture(scope="module")
@@ -108,8 +118,9 @@ def test_columns_of_later_options_count_only_where_they_have_a_value(run_dir: Pa
     (batch,) = table.to_batches()
     (older,) = table.drop_columns(sorted(ADDED)).to_batches()
     same = [new == old for new, old in zip(canonical_rows(batch), canonical_rows(older), strict=True)]
-    assert same == pa.compute.is_null(table["solid_lod23"]).to_pylist()
-    assert same.count(False) == 1
+    unasked = pa.compute.and_(*(pa.compute.is_null(table[name]) for name in ("solid_lod23", "boxes")))
+    assert same == unasked.to_pylist()
+    assert same.count(False) == 2
 
 
 def test_only_the_figures_of_a_reason_count(run_dir: Path, tmp_path: Path) -> None:

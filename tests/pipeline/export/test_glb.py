@@ -19,7 +19,7 @@ from pipeline.export.tile import write_tile
 from pipeline.model import BuildingResult, FaceKind
 
 CRSES = ["compound", "feet and metres", "US feet", "unknown"]
-BUILT = (small.gable, small.courtyard, small.two_parts, small.pent, small.boxed)
+BUILT = (small.gable, small.courtyard, small.two_parts, small.pent)
 SURFACES = {"RoofSurface": FaceKind.ROOF, "WallSurface": FaceKind.WALL, "GroundSurface": FaceKind.GROUND}
 
 
@@ -225,3 +225,16 @@ def test_a_file_holds_one_level_of_detail_and_says_it(contexts: Contexts) -> Non
     assert volumes["1.3"] == {"levelled": ("1.3", 476.0), "courtyard": court}
     assert volumes["1.2"] == {"levelled": ("1.2", 504.0), "courtyard": court}
     assert glb_bytes(lines_of([small.gable()], contexts["compound"]), lod="1.3") == b""
+
+
+def test_boxes_on_a_roof_are_parts_of_their_building_in_lod22_alone(contexts: Contexts) -> None:
+    result = small.boxed()
+    (node,) = read_glb(written([result], contexts["compound"])).nodes.values()
+    for number, box in enumerate(result.boxes or ()):
+        tops = [area_vector(box.vertices, face.rings) for face in box.faces if face.kind is FaceKind.ROOF]
+        wanted = sum(float(np.linalg.norm(vector)) for vector in tops)
+        assert area(triangles_of(node, f"boxed-box{number}", "RoofSurface")) == pytest.approx(wanted, rel=1e-6)
+    rows = [(result, building_row(result, contexts["compound"]))]
+    lines = list(cityjson_lines(rows, contexts["compound"].reference, "test"))
+    (main,) = read_glb(glb_bytes(lines, lod="2.0")).nodes.values()
+    assert {primitive.extras["part"] for primitive in main.primitives} == {"boxed-0"}

@@ -25,14 +25,14 @@ from pipeline.quality.detection import detection_confidence
 
 DESIGNED = """building_id, source_id, source_attributes, status, reason, reason_detail, overridden, method, roof_type,
 geometry, lod, solid, solid_parts, solid_surfaces, solid_planes, solid_lod12, solid_lod12_parts, solid_lod12_surfaces,
-solid_lod13, solid_lod13_parts, solid_lod13_surfaces, solid_lod23, solid_lod23_parts, solid_lod23_surfaces,
-solid_lod23_planes, ground_z, ground_source, eave_z, ridge_z, h_min, h_50p, h_70p, h_max, height_m, height_source,
-footprint_area_m2, footprint_share, roof_area_m2, volume_m3, n_points, density_per_m2, through_share,
-detection_confidence, n_planes, rmse_m, p95_m, coverage, point_spacing_m, noise_m, share_within_0_2m, share_below_roof,
-unexplained_m2, extrapolated_share, largest_hole_m, ridge_z_sigma_m, outline_sigma_m, bic_margin,
-is_curved, valid, validity_codes, touches_data_edge, strip_offset_m, ground_noise_m, wall_outline, overhang_m,
-overhang_sigma_m, overhang_source, lod23_reason, guides_followed, guides_not_followed, acquired_from, acquired_to,
-mesh_path, input_hash, settings_hash, engine_version"""
+solid_lod13, solid_lod13_parts, solid_lod13_surfaces, solid_lod20, solid_lod20_parts, solid_lod20_surfaces,
+solid_lod23, solid_lod23_parts, solid_lod23_surfaces, solid_lod23_planes, boxes, ground_z, ground_source, eave_z,
+ridge_z, h_min, h_50p, h_70p, h_max, height_m, height_source, footprint_area_m2, footprint_share, roof_area_m2,
+volume_m3, n_points, density_per_m2, through_share, detection_confidence, n_planes, rmse_m, p95_m, coverage,
+point_spacing_m, noise_m, share_within_0_2m, share_below_roof, unexplained_m2, extrapolated_share, largest_hole_m,
+ridge_z_sigma_m, outline_sigma_m, bic_margin, is_curved, valid, validity_codes, touches_data_edge, strip_offset_m,
+ground_noise_m, wall_outline, overhang_m, overhang_sigma_m, overhang_source, lod23_reason, n_boxes, guides_followed,
+guides_not_followed, acquired_from, acquired_to, mesh_path, input_hash, settings_hash, engine_version"""
 CRSES = ["compound", "feet and metres", "US feet", "unknown"]
 
 
@@ -103,11 +103,12 @@ def test_what_a_failed_candidate_lacks_is_null_and_not_zero(contexts: Contexts) 
         *("strip_offset_m", "ground_noise_m", "wall_outline", "overhang_m", "overhang_sigma_m"),
         *("overhang_source", "lod23_reason"),
         *("through_share", "detection_confidence", "ground_source", "height_source"),
-        *("guides_followed", "guides_not_followed"),
+        *("guides_followed", "guides_not_followed", "boxes", "n_boxes"),
         *("bic_margin", "source_attributes", "overridden", "mesh_path", "input_hash"),
         *("solid", "solid_parts", "solid_surfaces", "solid_planes"),
         *("solid_lod12", "solid_lod12_parts", "solid_lod12_surfaces"),
         *("solid_lod13", "solid_lod13_parts", "solid_lod13_surfaces"),
+        *("solid_lod20", "solid_lod20_parts", "solid_lod20_surfaces"),
         *("solid_lod23", "solid_lod23_parts", "solid_lod23_surfaces", "solid_lod23_planes"),
     }
     assert (row["valid"], row["n_planes"], row["coverage"], row["ground_z"]) == (False, 0, 0.0, 2.0)
