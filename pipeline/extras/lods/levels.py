@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 
 from pipeline.building.drawing import Building, DrawnModel
 from pipeline.building.record import record_of
@@ -53,7 +53,7 @@ def _levels(lods: Sequence[str], models: Sequence[LodParts]) -> Iterator[Decisio
         )
 
 
-def _lod_model(model: LodParts, number: Mapping[int, int]) -> LodModel:
+def _lod_model(model: LodParts, number: dict[int, int]) -> LodModel:
     """A coarser model as it is delivered; `number` is that of each plane in the record, which LoD2.0 shares."""
     solids, planes = tuple(part.solid for part in model.parts), tuple(model.planes)
     if model.lod == "2.0":

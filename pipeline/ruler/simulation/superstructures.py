@@ -70,7 +70,7 @@ def true_superstructures(buildings: tuple[Building, ...]) -> Iterator[TrueSupers
 def _roof_z_m(building: Building, place: shapely.Point) -> float:
     """Elevation of a roof at a place."""
     return max(
-        plane.a * place.x + plane.b * place.y + plane.c
+        float(plane.a * place.x + plane.b * place.y + plane.c)
         for plane, face in zip(building.planes, building.roof_polygons(), strict=True)
         if shapely.force_2d(face).intersects(place)
     )

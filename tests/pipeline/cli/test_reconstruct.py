@@ -86,7 +86,7 @@ def test_levels_of_detail_are_written_side_by_side(scene: Path, run: Run, tmp_pa
     assert meshes[own.name].read_bytes() == own.read_bytes()
     code, said, _ = invoke(*words, "--lods", "2.1")
     assert code == ExitCode.USAGE
-    assert "lods is '2.1': use one of 1.2, 1.3, 2.2" in said
+    assert "lods is '2.1': use one of 1.2, 1.3, 2.0, 2.2" in said
 
 
 def test_the_stages_are_reported_in_order(run: Run) -> None:
