@@ -132,11 +132,11 @@ def test_a_form_that_is_beaten_later_is_listed_with_what_it_explains(monkeypatch
 
 def test_invalid_solids_are_listed_with_their_codes_and_the_block_behind_them(monkeypatch: pytest.MonkeyPatch) -> None:
     usual, judged = check_solid, iter([(306,)] * 3)
-    for name in ("form_search", "drawing", "record"):
-        monkeypatch.setattr(f"pipeline.building.{name}.check_solid", lambda solid: next(judged, None) or usual(solid))
+    for name in ("building.form_search", "building.drawing", "extras.lods.levels"):
+        monkeypatch.setattr(f"pipeline.{name}.check_solid", lambda solid: next(judged, None) or usual(solid))
     monkeypatch.setattr("pipeline.roof.traced_forms.traced_forms", lambda *_: iter(()))
     given = gable()
-    monkeypatch.setattr("pipeline.extras.lods.lower_lods.lower_lods", lambda *_: [])
+    monkeypatch.setattr("pipeline.extras.lods.levels.lower_lods", lambda *_: [])
     result = reconstruct_building(given, "arrangement", ReconstructSettings())
     codes = [entry.validity_codes for entry in forms(result)[:3]]
     assert outcomes(result)[:3] == [("arrangement", "invalid")] * 3
@@ -147,7 +147,7 @@ def test_invalid_solids_are_listed_with_their_codes_and_the_block_behind_them(mo
 def test_a_model_that_is_not_delivered_is_withdrawn_and_the_block_is_chosen() -> None:
     settings = ReconstructSettings(lods=("1.2", "2.2"))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pipeline.extras.lods.lower_lods.lower_lods", lambda *_: [])
+        patch.setattr("pipeline.extras.lods.levels.lower_lods", lambda *_: [])
         result = reconstruct_building(gable(), "arrangement", settings)
     assert result.status is Status.FALLBACK
     assert outcomes(result) == [("arrangement", "withdrawn"), ("block", "chosen")]

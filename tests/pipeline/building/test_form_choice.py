@@ -67,8 +67,8 @@ def test_a_block_that_cannot_be_drawn_gives_way_to_the_next(monkeypatch: pytest.
     monkeypatch.setattr("pipeline.recipe.arranged_forms", lambda *_: iter(()))
     judged = iter([(306,)])
     usual = check_solid
-    for name in ("form_search", "drawing", "record"):
-        monkeypatch.setattr(f"pipeline.building.{name}.check_solid", lambda solid: next(judged, None) or usual(solid))
+    for name in ("building.form_search", "building.drawing", "extras.lods.levels"):
+        monkeypatch.setattr(f"pipeline.{name}.check_solid", lambda solid: next(judged, None) or usual(solid))
     result = reconstruct_building(gable(), "arrangement", ReconstructSettings())
     assert (result.status, result.lod) == (Status.FALLBACK, "1.2")
     assert result.reason_detail.startswith("validity codes none")

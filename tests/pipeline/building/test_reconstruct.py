@@ -156,8 +156,8 @@ def test_a_solid_that_stays_invalid_becomes_a_block_with_the_codes(monkeypatch: 
     def judge(solid: Solid) -> tuple[int, ...]:
         return (204, 303) if sum(face.kind is FaceKind.ROOF for face in solid.faces) > 1 else ()
 
-    for name in ("form_search", "drawing", "record"):
-        monkeypatch.setattr(f"pipeline.building.{name}.check_solid", judge)
+    for name in ("building.form_search", "building.drawing", "extras.lods.levels"):
+        monkeypatch.setattr(f"pipeline.{name}.check_solid", judge)
     result = modelled(gable())
     assert (result.status, result.reason, result.lod) == (Status.FALLBACK, Reason.INVALID_SOLID, "1.2")
     assert result.validity_codes == (204, 303)
@@ -165,8 +165,8 @@ def test_a_solid_that_stays_invalid_becomes_a_block_with_the_codes(monkeypatch: 
 
 
 def test_nothing_invalid_is_delivered_even_where_no_block_passes(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("form_search", "drawing", "record"):
-        monkeypatch.setattr(f"pipeline.building.{name}.check_solid", lambda _: (305,))
+    for name in ("building.form_search", "building.drawing", "extras.lods.levels"):
+        monkeypatch.setattr(f"pipeline.{name}.check_solid", lambda _: (305,))
     result = modelled(gable())
     assert (result.status, result.reason, result.solids) == (Status.FAILED, Reason.NO_FOOTPRINT, ())
 
