@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -51,7 +52,7 @@ def record_of(
         is_planar=model.lod >= "2",
         bic_margin=model.bic_margin,
     )
-    if model.lod == "2.2" and has_directions(np.reshape([plane.normal for plane in planes], (-1, 3))):
+    if model.lod >= "2" and has_directions(np.reshape([plane.normal for plane in planes], (-1, 3))):
         from pipeline.quality.bent_roofs import is_curved_roof
 
         quality = dataclasses.replace(quality, is_curved=is_curved_roof(planes, faces, solids, model.roof_type))
