@@ -112,12 +112,12 @@ def likeliest(
         polygon = None if ring is None else shapely.polygons(ring)
         if ring is None or polygon is None or polygon.area <= 0.0 or not polygon.is_valid:
             continue
-        if shapely.distance(shapely.points(ring), raw).max() > _FARTHEST * spacing_mm:
-            continue
         total = prices.edge * len(ring) + prices.free * sum(not run.exact for run in runs)
+        total += len(xy_mm) * math.log(polygon.area / spacing_mm**2)
+        if total >= least or shapely.distance(shapely.points(ring), raw).max() > _FARTHEST * spacing_mm:
+            continue
         off = shapely.distance(places, polygon)
-        total += prices.sharp * sharp_corners(ring) + len(xy_mm) * math.log(polygon.area / spacing_mm**2)
-        total += float(np.minimum(0.5 * (off / _OFF_MM) ** 2, _MOST).sum())
+        total += prices.sharp * sharp_corners(ring) + float(np.minimum(0.5 * (off / _OFF_MM) ** 2, _MOST).sum())
         if total < least:
             best, least = ring, total
     return best

@@ -97,10 +97,10 @@ def _chords(
     """The walls along borders between units, (n, 2) each; they end on the outline, edges (e, 4), or on other walls."""
     scale = Scale.of(spacing_m)
     walls = []
-    pieces = shapely.linestrings(edges.reshape(-1, 2, 2))
+    pieces, runs = shapely.linestrings(edges.reshape(-1, 2, 2)), _edge_runs(edges)
     for border in _through(borders):
-        near = edges[shapely.distance(LineString(border), pieces) <= _NEARBY_MM]
-        directions = pairs_of(peaks_of(_edge_runs(near)))
+        near = np.flatnonzero(shapely.dwithin(pieces, LineString(border), _NEARBY_MM)).tolist()
+        directions = pairs_of(peaks_of([runs[k] for k in near]))
         walls.append(Wall(border, directions, _described(border, directions, scale)))
     _put_in_line(walls, edges, scale)
     obstacles = obstacles_of(edges, [wall.line(scale) for wall in walls])
