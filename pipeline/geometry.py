@@ -254,14 +254,13 @@ def _spacings(plan: bytes) -> tuple[float, float, float]:
     if k < 1:
         return math.nan, math.nan, math.inf
     found = _nearest_neighbours(points, k, 0.0, False)[1]
-    nearest = math.sqrt(float(np.median(found[:, 0])))
-    squares = np.sort(found[:, k - 1])
-    median = 0.5 * float(squares[(n - 1) // 2] + squares[n // 2])
+    nearest, squares = np.sort(found[:, 0]), np.sort(found[:, k - 1])
+    near, median = (0.5 * float(of[(n - 1) // 2] + of[n // 2]) for of in (nearest, squares))
     covered = np.cumsum(squares)
     middle = float(squares[min(int(np.searchsorted(covered, 0.5 * covered[-1])), n - 1)])
     # pi density r_k^2 is Gamma(k) distributed; its median is k - 1/3 within 2 % for k >= 1; weighted with itself a
     # Gamma(k) variate is Gamma(k + 1) distributed
-    return math.sqrt(median * math.pi / (k - 1.0 / 3.0)), math.sqrt(middle * math.pi / (k + 2.0 / 3.0)), nearest
+    return math.sqrt(median * math.pi / (k - 1.0 / 3.0)), math.sqrt(middle * math.pi / (k + 2.0 / 3.0)), math.sqrt(near)
 
 
 @kernel

@@ -12,7 +12,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 import shapely
@@ -123,26 +123,26 @@ def _shares(piece: Polygon, first: Claim, second: Claim) -> tuple[list[Polygon],
     """What both take from the other in one piece of their overlap, by the least cost; of equal ones the first one."""
     own, other = _inside(piece, first.points_mm), _inside(piece, second.points_mm)
     none: list[Polygon] = []
-    options = [([piece], none, len(other)), (none, [piece], len(own))]
-    if min(len(own), len(other)) >= _FEWEST_WRONG:
-        options.extend(_chords(piece, own, other))
     whole = first.effort, second.effort
-    least, best = math.inf, options[0]
+    least, best = math.inf, ([piece], none, len(other))
 
     def compare(mine: list[Polygon], theirs: list[Polygon], wrong: int) -> None:
         nonlocal least, best
-        cost = _WRONG_COST * wrong
-        for claim, lost, as_it_is in ((first, theirs, whole[0]), (second, mine, whole[1])):
-            if not lost:
-                cost += as_it_is
-            elif cost < least:
+        # whatever is left of an outline is a part at least
+        cost = _WRONG_COST * wrong + (_PART_COST if theirs else whole[0]) + (_PART_COST if mine else whole[1])
+        for claim, lost in ((first, theirs), (second, mine)):
+            if lost and cost < least:
                 left = shapely.difference(claim.outline_mm, MultiPolygon(lost), grid_size=1.0)
-                cost += effort(left) + (_BARRED if left.area < _KEPT_SHARE * claim.outline_mm.area else 0.0)
+                cost += effort(left) - _PART_COST
+                cost += _BARRED if left.area < _KEPT_SHARE * claim.outline_mm.area else 0.0
         if cost < least:
             least, best = cost, (mine, theirs, wrong)
 
-    for option in options:
-        compare(*option)
+    compare(*best)
+    compare(none, [piece], len(own))
+    if min(len(own), len(other)) >= _FEWEST_WRONG:
+        for option in _chords(piece, own, other, lambda wrong: _WRONG_COST * wrong + 2.0 * _PART_COST < least):
+            compare(*option)
     if least - _WRONG_COST * best[2] > sum(whole):  # corners came in
         for taken, wrong in _retreats(piece, second, (least - whole[0] - _PART_COST) / _WRONG_COST):
             compare(taken, none, wrong)
@@ -184,8 +184,13 @@ def _retreats(piece: Polygon, claim: Claim, most: float) -> Iterator[tuple[list[
         longest = across / reach
 
 
-def _chords(piece: Polygon, own: IntArray, other: IntArray) -> Iterator[tuple[list[Polygon], list[Polygon], int]]:
-    """Divisions of a piece along a line parallel to one of its longest edges, where most points are on their side."""
+def _chords(
+    piece: Polygon, own: IntArray, other: IntArray, is_worth: Callable[[int], bool]
+) -> Iterator[tuple[list[Polygon], list[Polygon], int]]:
+    """Divisions of a piece along a line parallel to one of its longest edges, where most points are on their side.
+
+    Left out where so many on the wrong one are not worth it.
+    """
     ring = shapely.get_coordinates(piece.exterior)
     edges = np.diff(ring, axis=0)
     corner = np.floor(ring[0])
@@ -202,10 +207,11 @@ def _chords(piece: Polygon, own: IntArray, other: IntArray) -> Iterator[tuple[li
         middle = across * 0.5 * (offset[order[best]] + offset[order[best + 1]]) + corner
         ends = np.rint(np.array([middle - along * reach, middle + along * reach]))
         half = Polygon([*ends, ends[1] - np.rint(across * reach), ends[0] - np.rint(across * reach)])
-        near = polygons_of(shapely.intersection(piece, half, grid_size=1.0))
-        far = polygons_of(shapely.difference(piece, half, grid_size=1.0))
         wrong = len(own) - int(behind[best]) if behind[best] > 0.5 * sign.sum() else len(other) + int(behind[best])
-        yield (near, far, wrong) if behind[best] > 0.5 * sign.sum() else (far, near, wrong)
+        if is_worth(wrong):
+            near = polygons_of(shapely.intersection(piece, half, grid_size=1.0))
+            far = polygons_of(shapely.difference(piece, half, grid_size=1.0))
+            yield (near, far, wrong) if behind[best] > 0.5 * sign.sum() else (far, near, wrong)
 
 
 def effort(area: shapely.Geometry) -> float:

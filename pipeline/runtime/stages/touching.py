@@ -15,6 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TypeVar
 
 import numpy as np
+import numpy.typing as npt
 import shapely
 from shapely import MultiPolygon
 
@@ -31,7 +32,7 @@ from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import OpenScratch, Scratch
 from pipeline.runtime.scratch.outcomes import Files, InParts, Place, brief_within, drop_outcomes, key_of
 from pipeline.runtime.stages.beside import points_beside
-from pipeline.runtime.stages.gather import gather, stored_points
+from pipeline.runtime.stages.gather import gather, points_of, stored_points
 from pipeline.runtime.stages.sites import (
     CandidateSite,
     GroupFigures,
@@ -194,10 +195,9 @@ def _outlines_of(
 
     @functools.lru_cache(maxsize=_HELD)
     def claim(k: int) -> Claim:
-        points = stored_points(task.scratch, sites[k])
+        points = points_of(task.scratch, sites[k])
         places: IntArray = np.column_stack([points[axis] for axis in "xyz"]).astype(np.int64)
-        order = np.lexsort(places.T[::-1])
-        return Claim(name=sites[k].building_id, outline_mm=drawn[k], points_mm=places[order])
+        return Claim(name=sites[k].building_id, outline_mm=drawn[k], points_mm=places)
 
     def of_pair(i: int, j: int) -> tuple[MultiPolygon, MultiPolygon]:
         first, second = (
@@ -288,7 +288,7 @@ def _taken(
     number, outlines = np.array(list(drawn)), np.array(list(drawn.values()), dtype=object)
     member = np.array([pair for pair, areas in around.items() for _ in areas], np.int64).reshape(-1, 2)
     area = np.array([area for areas in around.values() for area in areas], dtype=object)
-    for (i, j), found in _slits(own, around, sites, drawn, task, warnings).items():
+    for (i, j), found in _slits(own, area, member, sites, drawn, task, warnings).items():
         parts = _or_warned(warnings, (sites[i], sites[j]), functools.partial(closed, drawn[i], drawn[j], found))
         for k, other, pieces in zip((i, j), (j, i), parts or ([], []), strict=True):
             taken[k, other] = []
@@ -300,7 +300,8 @@ def _taken(
 
 def _slits(
     pairs: Sequence[tuple[int, int]],
-    around: Mapping[tuple[int, int], Sequence[shapely.Polygon]],
+    area: npt.NDArray[np.object_],
+    member: IntArray,
     sites: Sequence[CandidateSite],
     drawn: Mapping[int, MultiPolygon],
     task: TouchTask,
@@ -308,16 +309,17 @@ def _slits(
 ) -> dict[tuple[int, int], list[Slit]]:
     """The slits between pairs of outlines that a wall or a roof fills, by pair: points lie in them, but no ground.
 
-    Those narrower than the point spacing may be empty. `around` are the areas between the outlines of all pairs. A task
-    knows all outlines that reach into the boxes of both, so another task finds the same slits.
+    Those narrower than the point spacing may be empty. Areas (n,) lie between the outlines of all pairs, `member`
+    (n, 2). A task knows all outlines that reach into the boxes of both, so another task finds the same slits.
     """
 
     def of_pair(i: int, j: int) -> list[Slit]:
         known = shapely.intersection(*(shapely.box(*(sites[k].reach_mm or ())) for k in (i, j)))
         third = [outlines[k] for k in sorted(tree.query(known, "intersects").tolist()) if numbers[k] not in (i, j)]
         third = [one for one in third if shapely.dwithin(one, (drawn[i], drawn[j]), _BESIDE_MM).any()]
-        others = [area for pair, areas in around.items() if pair != (i, j) for area in areas if area.intersects(known)]
-        return slits((drawn[i], drawn[j]), around[i, j], shapely.buffer(known, -GAP_MM), third, others)
+        is_own = (member == (i, j)).all(axis=1)
+        others = area[~is_own & shapely.intersects(area, known)].tolist()
+        return slits((drawn[i], drawn[j]), area[is_own].tolist(), shapely.buffer(known, -GAP_MM), third, others)
 
     numbers, outlines = list(drawn), list(drawn.values())
     tree = shapely.STRtree(outlines)
