@@ -42,6 +42,8 @@ _FLAT = math.sin(math.radians(12.0))
 _SQUARE = math.sin(math.radians(81.0))
 _LEAST_PROGRESS = 0.3
 """The chord of an edge is at least this share of the border along it, in the edge's direction."""
+_DETOUR = 5.0
+"""Edges that go around a place at which no edge can begin."""
 
 
 @kernel
@@ -181,6 +183,8 @@ def least_description(
     costs = np.empty((d + 1, m))
     # with another start one turn may cost less, and the end, where it has a price
     spare = (2 - math.isnan(met[1])) * (prices.change + max(prices.sharp, prices.flat))
+    # turns between common directions are paid already, but an edge that begins anew may not get on at once
+    paid = _DETOUR * prices.edge
     for j in range(1, m):
         for k in range(d + 1):
             # the start that won last goes first: few of the others then need more than their costs
@@ -233,7 +237,11 @@ def least_description(
                 ways[j, state, 0], ways[j, state, 1] = vx, vy
         _turn(best[j], turns, before[j], through[j])
         for k in range(d + 1):
-            most = max(before[j, 2 * k], before[j, min(2 * k + 1, free)]) + spare
+            one, other = 2 * k, min(2 * k + 1, free)
+            most = max(
+                before[j, one] + (spare if free in (one, through[j, one]) else paid),
+                before[j, other] + (spare if free in (other, through[j, other]) else paid),
+            )
             alive[k] = _kept(live[k], costs[k, : alive[k]], most)
             live[k, alive[k] - 1] = j
     state = int(np.argmin(best[m - 1]))

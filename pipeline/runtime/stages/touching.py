@@ -21,7 +21,7 @@ from shapely import MultiPolygon
 
 from pipeline.errors import BuildingError, GableworkError
 from pipeline.io.gps_time import GpsTimeKind
-from pipeline.model import FloatArray, IntArray
+from pipeline.model import Candidate, FloatArray, IntArray
 from pipeline.prepared_cloud import prepare_cloud
 from pipeline.roof.disjoint_outlines import Claim, divided, left_of
 from pipeline.roof.footprint import polygons_of
@@ -67,6 +67,9 @@ ACROSS = 2
 """A task takes so many tiles across: along their borders everything is done twice."""
 _HELD = 16
 """Candidates whose points stay in memory from one overlap to the next."""
+_MOST_BEFORE = 1000
+_drawn_before: dict[tuple[str, float, RoofSettings], MultiPolygon | None] = {}
+"""Outlines that this process drew, by what they are drawn from: tasks side by side draw some of the same ones."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -392,10 +395,18 @@ def _drawn_mm(site: CandidateSite, task: TouchTask) -> MultiPolygon | None:
         return shapely.transform(site.outline, lambda xy: np.rint(xy * MM))
     if site.points < task.roof.min_points:
         return None
-    candidate, _ = gather(task.scratch, task.grid, site, GpsTimeKind.NONE, task.roof)
+    candidate, facts = gather(task.scratch, task.grid, site, GpsTimeKind.NONE, task.roof)
+    key = facts.input_hash, candidate.ground_z_m, task.roof
+    if key not in _drawn_before:
+        if len(_drawn_before) >= _MOST_BEFORE:
+            _drawn_before.clear()
+        _drawn_before[key] = _drawn_alone_mm(candidate, task.roof)
+    return _drawn_before[key]
+
+
+def _drawn_alone_mm(candidate: Candidate, settings: RoofSettings) -> MultiPolygon | None:
     try:
-        roof = roof_points(prepare_cloud(candidate, task.roof.max_points), task.roof)
-        outline_mm = drawn_outline(roof, task.roof)
+        outline_mm = drawn_outline(roof_points(prepare_cloud(candidate, settings.max_points), settings), settings)
     except (BuildingError, shapely.errors.GEOSException):
         return None
     corner = np.array(candidate.origin[:2]) * MM
