@@ -43,7 +43,7 @@ _SQUARE = math.sin(math.radians(81.0))
 _LEAST_PROGRESS = 0.3
 """The chord of an edge is at least this share of the border along it, in the edge's direction."""
 _DETOUR = 5.0
-"""Edges that go around a place at which no edge can begin."""
+"""Where turns are paid already, starts may cost so many edges more: near a new start an edge may not get on."""
 
 
 @kernel
@@ -183,7 +183,6 @@ def least_description(
     costs = np.empty((d + 1, m))
     # with another start one turn may cost less, and the end, where it has a price
     spare = (2 - math.isnan(met[1])) * (prices.change + max(prices.sharp, prices.flat))
-    # turns between common directions are paid already, but an edge that begins anew may not get on at once
     paid = _DETOUR * prices.edge
     for j in range(1, m):
         for k in range(d + 1):

@@ -405,6 +405,7 @@ def _drawn_mm(site: CandidateSite, task: TouchTask) -> MultiPolygon | None:
 
 
 def _drawn_alone_mm(candidate: Candidate, settings: RoofSettings) -> MultiPolygon | None:
+    """The same from the points of the candidate."""
     try:
         outline_mm = drawn_outline(roof_points(prepare_cloud(candidate, settings.max_points), settings), settings)
     except (BuildingError, shapely.errors.GEOSException):
