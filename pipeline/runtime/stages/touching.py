@@ -68,7 +68,7 @@ ACROSS = 2
 _HELD = 16
 """Candidates whose points stay in memory from one overlap to the next."""
 _MOST_BEFORE = 1000
-_drawn_before: dict[tuple[str, float, RoofSettings], MultiPolygon | None] = {}
+_drawn_before: dict[tuple[str | None, float, RoofSettings], MultiPolygon | None] = {}
 """Outlines that this process drew, by what they are drawn from: tasks side by side draw some of the same ones."""
 
 
