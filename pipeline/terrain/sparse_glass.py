@@ -68,7 +68,7 @@ def _nearest(v: int, vertices: SceneVertices, cells: Cells, found: IntArray) -> 
     """
     x, y = vertices.x_mm, vertices.y_mm
     distance = np.empty(found.size, np.int64)
-    count = 0
+    count, farthest = 0, (REACH * SQUARE_MM) ** 2
     c, r = x[v] // SQUARE_MM - cells.column0, y[v] // SQUARE_MM - cells.row0
     for ring in range(REACH + 1):
         for rr in range(max(r - ring, 0), min(r + ring + 1, cells.rows)):
@@ -80,20 +80,37 @@ def _nearest(v: int, vertices: SceneVertices, cells: Cells, found: IntArray) -> 
                 for m in range(cells.start[cell], cells.start[cell + 1]):
                     w = cells.members[m]
                     away = (x[w] - x[v]) ** 2 + (y[w] - y[v]) ** 2
-                    if w == v or away > (REACH * SQUARE_MM) ** 2:
+                    if w == v or away > farthest:
                         continue
                     k = min(count, found.size - 1)
-                    if count == found.size and (away > distance[k] or (away == distance[k] and w > found[k])):
+                    if count == found.size and away == farthest and w > found[k]:
                         continue
                     while k > 0 and (away < distance[k - 1] or (away == distance[k - 1] and w < found[k - 1])):
                         distance[k], found[k] = distance[k - 1], found[k - 1]
                         k -= 1
                     distance[k], found[k] = away, w
                     count = min(count + 1, found.size)
+                    if count == found.size:
+                        farthest = distance[count - 1]
         # what lies beyond this ring is farther
         if count == found.size and distance[count - 1] <= (ring * SQUARE_MM) ** 2:
             break
     return count
+
+
+@kernel
+def _on_all_sides(v: int, vertices: SceneVertices, cells: Cells) -> bool:
+    """Whether the squares that `_nearest` looks at for v have members north, south, west and east of it, or beside."""
+    c, r = vertices.x_mm[v] // SQUARE_MM - cells.column0, vertices.y_mm[v] // SQUARE_MM - cells.row0
+    first, last = max(c - REACH, 0), min(c + REACH + 1, cells.columns)
+    north, south, west, east = 0, 0, 0, 0
+    for rr in range(max(r - REACH, 0), min(r + REACH + 1, cells.rows)):
+        row = cells.start[rr * cells.columns : (rr + 1) * cells.columns + 1]
+        west += row[c + 1] - row[first]
+        east += row[last] - row[c]
+        north += row[last] - row[first] if rr >= r else 0
+        south += row[last] - row[first] if rr <= r else 0
+    return min(north, south, west, east) > 0
 
 
 @kernel
@@ -119,7 +136,7 @@ def _surrounded(
     """Which wanted vertices (v,) lie among the nearest higher ones, up to `most`; low ones also lie well below them."""
     around = np.empty(most, np.int64)
     for v in range(part.size):
-        if not wanted[v]:
+        if not (wanted[v] and _on_all_sides(v, vertices, high)):
             continue
         count = _nearest(v, vertices, high, around)
         near, rise = min(count, _AROUND), 0
