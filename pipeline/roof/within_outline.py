@@ -92,7 +92,7 @@ def _fitted(partition: RoofPartition, outline_mm: MultiPolygon) -> RoofPartition
         ring if moved.keys().isdisjoint(ring) and len(set(ring)) == len(ring) - 1 else _moved(ring, moved)
         for ring in given
     ]
-    edges = Counter(_edge(a, b) for ring in rings for a, b in pairwise(ring) if a != b)
+    edges = Counter([(a, b) if a < b else (b, a) for ring in rings for a, b in pairwise(ring) if a != b])
     outer = [edge for edge, times in edges.items() if times == 1]
     if not outer:
         return None
@@ -145,19 +145,14 @@ def _moved(ring: list[XY], moved: dict[XY, XY]) -> list[XY]:
     return [*places, places[0]]
 
 
-def _edge(a: XY, b: XY) -> tuple[XY, XY]:
-    """An edge in either direction."""
-    return (a, b) if a < b else (b, a)
-
-
 def _with_corners(ring: list[XY], between: dict[tuple[XY, XY], list[XY]]) -> list[XY]:
     """A closed ring with the vertices that some of its edges, by their ends, take."""
     if not between:
         return ring
     longer = ring[:1]
     for a, b in pairwise(ring):
-        path = between.get(_edge(a, b), [a, b])
-        longer += path[1:] if path[0] == a else path[-2::-1]
+        path = between.get((a, b)) or between.get((b, a), [b, a])[::-1]
+        longer += path[1:]
     return longer
 
 
