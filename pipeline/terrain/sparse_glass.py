@@ -188,20 +188,22 @@ def _near(squares: BoolArray, near: int) -> BoolArray:
 def _glass(vertices: SceneVertices, part: KindArray, every: Cells, high: Cells, may_be: BoolArray) -> BoolArray:
     """Which squares (rows, columns) lie under glass, of those that may by what the squares around them hold."""
     x, y, is_low = vertices.x_mm, vertices.y_mm, part == Part.LOW
-    inner = np.zeros(part.size, np.bool_)
-    # the squares around, and as far beyond them as their vertices have neighbours
-    for kind in (is_low, part >= Part.ROUGH):
-        searched = kind & _inside(x, y, _near(may_be, NEAR + REACH), every)
+    inner, no = np.zeros((2, part.size), np.bool_)
+    # the higher ones first, as if all low ones were surrounded: few squares are left, and most vertices are low
+    for least, reach, taken in ((Part.ROUGH, 0, is_low), (Part.LOW, REACH, no)):
+        # the squares around, and at last as far beyond them as their vertices have neighbours
+        searched = (part >= least) & _inside(x, y, _near(may_be, NEAR + reach), every)
         _surrounded(searched, vertices, part, high, _AROUND, inner)
-        may_be &= box_sums(count_in(x, y, is_low & inner, every), NEAR) >= FEWEST_LOW
+        counted = ~taken & _inside(x, y, _near(may_be, NEAR), every)
+        layers = _mixture(counted, vertices, part, inner | taken, every)
+        inner_high, mixed, low, low_neighbours, neighbours = (box_sums(layer, NEAR) for layer in layers)
+        may_be &= (inner_high >= FEWEST) & (mixed >= _MIXED_SHARE * inner_high)
         if not may_be.any():
             return may_be
-    layers = _mixture(_inside(x, y, _near(may_be, NEAR), every), vertices, part, inner, every)
-    inner_high, mixed, low, low_neighbours, neighbours = (box_sums(layer, NEAR) for layer in layers)
     share = low / np.maximum(low + inner_high, 1)
     company = low_neighbours / np.maximum(neighbours, 1)
     by_chance = company <= share + _COMPANY * (1.0 - share)
-    found: BoolArray = may_be & (inner_high >= FEWEST) & (mixed >= _MIXED_SHARE * inner_high) & by_chance
+    found: BoolArray = may_be & (low >= FEWEST_LOW) & by_chance
     return found
 
 
