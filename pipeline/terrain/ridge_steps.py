@@ -119,7 +119,7 @@ def _slopes(grown: GrownPatches, vertex: IntArray, strip: IntArray) -> Slopes:
             is_other = (1.0 + fall[part] * main) / np.sqrt((1.0 + fall[part] ** 2) * (1.0 + main**2)) < MIN_COSINE
             side_of[part[is_other]] = -1
             part = part[~is_other]
-            pitch[part] = np.average(fall[part], weights=size[part])
+            pitch[part] = (fall[part] * size[part]).sum() / size[part].sum()
     x, y, z = (values[vertex] / 1000.0 for values in grown.vertices[:3])
     _, near = _off_mm(grown, vertex)
     return Slopes(

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.compiler import kernel
+from pipeline.geometry import median_of
 from pipeline.kernels.normal_equations import add_to_sums, smallest_eigenvalue, solve_plane_moments
 from pipeline.kernels.sorting import counting_sort, radix_order
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray, Tin
@@ -428,10 +429,10 @@ def grown_patches(x: IntArray, y: IntArray, z: IntArray, tin: Tin) -> GrownPatch
     Vertices (n,) are in millimetres from a place near by, sorted by (x, y), under their Delaunay TIN.
     """
     radii, lengths = facet_sizes(x, y, tin.facets)
-    limit = _TYPICAL_RADII * float(np.median(radii))
+    limit = _TYPICAL_RADII * median_of(radii)
     is_sound = radii <= 1000.0 * min(max(limit / 1000.0, _MAX_RADIUS_M / 2.0), _MAX_RADIUS_M)
     sound = np.flatnonzero(is_sound).astype(np.int32)
-    half_mm = 0.5 * float(np.median(lengths[sound])) if len(sound) else 0.0
+    half_mm = 0.5 * median_of(lengths[sound].ravel()) if len(sound) else 0.0
     vertices = RoofVertices(x, y, z, *vertex_neighbours(len(x), tin.facets, sound))
     local = local_planes(x, y, z)
     label, planes = grow_patches(vertices, local, np.argsort(local[:, 2], kind="stable"))

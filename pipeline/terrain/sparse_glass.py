@@ -19,7 +19,7 @@ from pipeline.compiler import kernel
 from pipeline.model import BoolArray, IntArray, KindArray
 from pipeline.spatial_hash import points_by_cell
 from pipeline.terrain.facets import SceneVertices
-from pipeline.terrain.glass_squares import FEWEST, FEWEST_LOW, Cells, Part, box_sums, count_in
+from pipeline.terrain.glass_squares import FEWEST, FEWEST_LOW, Cells, Part, box_sums
 from pipeline.terrain.reach import GLASS_NEAR as NEAR
 from pipeline.terrain.reach import GLASS_SQUARE_MM as SQUARE_MM
 from pipeline.terrain.reach import GLASS_SQUARES as REACH

@@ -15,6 +15,7 @@ from shapely import MultiPolygon, Polygon
 
 from pipeline.compiler import kernel
 from pipeline.export.facts import CandidateFacts
+from pipeline.geometry import median_of
 from pipeline.io.gps_time import GpsTimeKind, utc_of
 from pipeline.kernels.sorting import radix_order
 from pipeline.model import BoolArray, Candidate, FloatArray, GivenHeights, GroundSource, Guide, IntArray
@@ -397,7 +398,7 @@ def noise_of_ground_m(around: Surroundings, points_per_cell: float) -> float:
     off_mm = _open_ground(around.off_mm, around.elevation_mm.astype(np.int64))
     if len(off_mm) < _FEWEST_GROUND_CELLS:
         return math.nan
-    lowest_mm = float(MAD_TO_SIGMA * np.median(np.abs(off_mm - np.median(off_mm))))
+    lowest_mm = MAD_TO_SIGMA * median_of(np.abs(off_mm - median_of(off_mm)))
     return float(lowest_mm * max(1.0, points_per_cell) ** _PER_POINTS / _OF_PLANE / MM)
 
 
