@@ -99,21 +99,6 @@ def _nearest(v: int, vertices: SceneVertices, cells: Cells, found: IntArray) -> 
 
 
 @kernel
-def _on_all_sides(v: int, vertices: SceneVertices, cells: Cells) -> bool:
-    """Whether the squares that `_nearest` looks at for v have members north, south, west and east of it, or beside."""
-    c, r = vertices.x_mm[v] // SQUARE_MM - cells.column0, vertices.y_mm[v] // SQUARE_MM - cells.row0
-    first, last = max(c - REACH, 0), min(c + REACH + 1, cells.columns)
-    north, south, west, east = 0, 0, 0, 0
-    for rr in range(max(r - REACH, 0), min(r + REACH + 1, cells.rows)):
-        row = cells.start[rr * cells.columns : (rr + 1) * cells.columns + 1]
-        west += row[c + 1] - row[first]
-        east += row[last] - row[c]
-        north += row[last] - row[first] if rr >= r else 0
-        south += row[last] - row[first] if rr <= r else 0
-    return min(north, south, west, east) > 0
-
-
-@kernel
 def _are_around(v: int, vertices: SceneVertices, around: IntArray) -> bool:
     """Whether no straight line through vertex v has all of some others on one side."""
     x, y = vertices.x_mm, vertices.y_mm
@@ -136,7 +121,7 @@ def _surrounded(
     """Which wanted vertices (v,) lie among the nearest higher ones, up to `most`; low ones also lie well below them."""
     around = np.empty(most, np.int64)
     for v in range(part.size):
-        if not (wanted[v] and _on_all_sides(v, vertices, high)):
+        if not wanted[v]:
             continue
         count = _nearest(v, vertices, high, around)
         near, rise = min(count, _AROUND), 0

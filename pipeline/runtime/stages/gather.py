@@ -395,10 +395,8 @@ def noise_of_ground_m(around: Surroundings, points_per_cell: float) -> float:
     k^-1/5 of their standard deviation (.67 for 8, exactly .61; cells differ in k, which brings it nearer), and a plane
     through nine cells leaves .9 of it.
     """
-    off_mm = _open_ground(around.off_mm, around.elevation_mm.astype(np.int64))
-    if len(off_mm) < _FEWEST_GROUND_CELLS:
-        return math.nan
-    lowest_mm = MAD_TO_SIGMA * median_of(np.abs(off_mm - median_of(off_mm)))
+    off = _open_ground(around.off_mm, around.elevation_mm.astype(np.int64))
+    lowest_mm = MAD_TO_SIGMA * median_of(np.abs(off - median_of(off))) if len(off) >= _FEWEST_GROUND_CELLS else math.nan
     return float(lowest_mm * max(1.0, points_per_cell) ** _PER_POINTS / _OF_PLANE / MM)
 
 
