@@ -60,6 +60,8 @@ _ROW_SPACINGS, _ROW_M = 1.5, 0.6
 """Extent of one row of points: where they are sparse, the slopes of houses are no wider than a few rows."""
 _ROUNDS = 2
 """Rounds of regression, merging and assignment: labels hardly change later."""
+_WAVES = 8.0
+"""Planes of one size from which on they may be the waves of fewer: of an undulating roof, or of strips that differ."""
 _MAD_TO_SIGMA = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
 
 
@@ -105,6 +107,14 @@ def detect_planes(points: FloatArray, spacing_m: float, settings: AdaptivePlaneS
     )
     neighbours = nearest_neighbours(nodes, _NEIGHBOURS)
     coefficients, labels = _detect(points, nodes, node_of, neighbours, spacing_m, limits)
+    sizes = np.bincount(labels[labels >= 0], minlength=1)
+    if sizes.sum() ** 2 >= _WAVES * (sizes * sizes).sum():
+        # neighbours on a wave say the same: their number proves no plane where half as many planes explain the points
+        wider = limits._replace(min_distance_m=settings.max_distance_m)
+        wide, wide_labels = _detect(points, nodes, node_of, neighbours, spacing_m, wider)
+        lost = np.count_nonzero(wide_labels < 0) - np.count_nonzero(labels < 0)
+        if 2 * len(wide) <= len(coefficients) and lost <= _PLANE_COST * (len(coefficients) - len(wide)):
+            coefficients, labels = wide, wide_labels
     return DetectedPlanes(coefficients=coefficients, labels=labels)
 
 
