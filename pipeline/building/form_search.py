@@ -18,7 +18,7 @@ from pipeline.quality.residuals import vertical_residuals
 from pipeline.quality.support import NOT_OF_FORM, NOT_OF_ROOF, doubt_of, support_of
 from pipeline.quality.validity import check_solid
 from pipeline.roof.forms import UNDRAWABLE, undrawable
-from pipeline.roof.named_form import NamedForm
+from pipeline.roof.named_form import TRACED, NamedForm
 from pipeline.roof.plan import RoofPlan
 from pipeline.roof.unlike_points import stays_near
 
@@ -32,8 +32,9 @@ def first_valid(
 ) -> tuple[DrawnModel | None, tuple[int, ...]]:
     """The first model that is valid throughout, or None and the codes of all faults.
 
-    A model with a large face made level waits: it is taken unless a later one explains more roof points. Of those the
-    first is taken whose faces stay near the points, else the one that explains most.
+    A model with a large face made level waits: it is taken unless a later one explains more roof points, of traced
+    faces by more than their number costs. Of those the first is taken whose faces stay near the points, else the one
+    that explains most.
     """
     decisions = building.decisions
     codes: set[int] = set()
@@ -68,11 +69,24 @@ def first_valid(
             return model, ()
         explained = explained_share(building, model)
         decisions.append(_tried(form, model, Outcome.OUTDONE, explained=explained))
-        if waiting is None or explained > share:
+        needed = _further_cost(building, waiting, model) if form.name == TRACED else 0.0
+        if waiting is None or explained > share + needed:
             waiting, share, at = model, explained, len(decisions) - 1
             if not model.is_levelled and stays_near(model.parts, building.roof):
                 decisions[at] = dataclasses.replace(decisions[at], outcome=Outcome.CHOSEN)
                 return model, ()
+
+
+def _further_cost(building: Building, before: DrawnModel | None, model: DrawnModel) -> float:
+    """Share of the roof points that the further faces and borders of a model cost; 0 if the one before contradicts."""
+    if before is None or (before.contradiction is not None and model.contradiction is None):
+        return 0.0
+    settings, cost = building.settings.plan, 0.0
+    for sign, one in ((1.0, model), (-1.0, before)):
+        faces = [face.polygon for part in one.parts for face in part.faces]
+        borders = 0.5 * math.fsum(face.length for face in faces) / building.roof.spacing_m
+        cost += sign * (settings.face_cost * len(faces) + settings.border_cost * borders)
+    return max(cost, 0.0) / len(building.roof.points)
 
 
 def _tried(
