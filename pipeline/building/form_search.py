@@ -69,7 +69,7 @@ def first_valid(
             return model, ()
         explained = explained_share(building, model)
         decisions.append(_tried(form, model, Outcome.OUTDONE, explained=explained))
-        needed = _further_cost(building, waiting, model) if form.name == TRACED else 0.0
+        needed = _further_cost(building, waiting, model) if form.name == TRACED and share >= _FEW_EXPLAINED else 0.0
         if waiting is None or explained > share + needed:
             waiting, share, at = model, explained, len(decisions) - 1
             if not model.is_levelled and stays_near(model.parts, building.roof):
