@@ -247,12 +247,12 @@ def _fitted(misfits: IntArray, label_of: LabelArray, held: IntArray, keys: IntAr
 
 @kernel(inline="always")
 def _narrowest_sliver(
-    plan: Subdivision, areas: FloatArray, faces: LabelArray, is_fitted: BoolArray, min_width_m: float
+    plan: Subdivision, areas: FloatArray, faces: LabelArray, is_fitted: BoolArray, inside: IntArray, min_width_m: float
 ) -> int:
     """The face that is the narrowest sliver of those with a neighbour, if narrower than the minimum; -1 for none.
 
     Width and length are those of the rectangle with the area and the perimeter of the face. A fitted face (f,) whose
-    long side is on the outline is a parapet and stays.
+    long side is on the outline is a parapet and stays. A face without points `inside` (f,) goes however short it is.
     """
     xy, graph = plan.xy, plan.graph
     count = len(is_fitted)
@@ -272,11 +272,11 @@ def _narrowest_sliver(
     least, sliver = min_width_m, -1
     for f in range(count):
         square = 0.25 * half[f] * half[f] - area[f]
-        if has_neighbour[f] and square > 0.0:
-            width = 0.5 * half[f] - math.sqrt(square)
+        if has_neighbour[f] and (square > 0.0 or inside[f] == 0):
+            width = 0.5 * half[f] - math.sqrt(max(square, 0.0))
             length = half[f] - width
             is_parapet = is_fitted[f] and outer[f] >= _ALONG * length
-            if width < least and length >= _SLIVER * width and not is_parapet:
+            if width < least and (length >= _SLIVER * width or inside[f] == 0) and not is_parapet:
                 least, sliver = width, f
     return sliver
 
@@ -346,6 +346,6 @@ def unite_faces(
             sliver = -1
         else:
             is_fitted = _fitted(data, label_of, inside, keys)
-            sliver = _narrowest_sliver(plan, areas, faces, is_fitted, limits.min_face_width_m)
+            sliver = _narrowest_sliver(plan, areas, faces, is_fitted, inside, limits.min_face_width_m)
             if sliver < 0:
                 return
