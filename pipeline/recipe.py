@@ -16,7 +16,7 @@ import numpy as np
 import shapely
 
 from pipeline.building.drawing import Building, own_model
-from pipeline.building.form_search import first_valid, judged, too_few_points, withdraw
+from pipeline.building.form_search import first_valid, judged, too_few_points
 from pipeline.building.record import delivered, failed_building, record_of
 from pipeline.errors import BuildingError
 from pipeline.methods import ReconstructSettings, method_named
@@ -122,12 +122,14 @@ def _reconstruct(
             building,
         )
         if model is not None:
-            if too_few := too_few_points(building, model, lack):
-                withdraw(building)
-                return failed_building(building.candidate, building.method, Reason.TOO_FEW_POINTS, too_few)
-            if record := delivered(building, model):
+            too_few = too_few_points(building, model, lack)
+            if not too_few and (record := delivered(building, model)):
                 return judged(building, record, plan, model)
+            from pipeline.building.blocks import withdraw
+
             withdraw(building)
+            if too_few:
+                return failed_building(building.candidate, building.method, Reason.TOO_FEW_POINTS, too_few)
         codes_met = ", ".join(map(str, codes)) or "none"
         fallback = BuildingError(Reason.INVALID_SOLID, f"validity codes {codes_met}: no form of the solid passes")
     except BuildingError as error:

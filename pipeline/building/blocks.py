@@ -11,7 +11,7 @@ import shapely
 from shapely import MultiPolygon
 
 from pipeline.building.drawing import Building, DrawnModel
-from pipeline.model import Plane
+from pipeline.model import DecisionKind, Outcome, Plane
 from pipeline.roof.block import block_forms, block_plane
 from pipeline.roof.footprint import hull_of_points, outline
 from pipeline.roof.named_form import BLOCK, NamedForm
@@ -44,3 +44,11 @@ def blocks(building: Building, plan: RoofPlan | None) -> Iterator[NamedForm[Draw
 def block_model(form: Callable[[], list[SolidPart]], plane: Plane) -> DrawnModel:
     """The block that a form draws."""
     return DrawnModel(lod="1.2", parts=form(), planes=[plane])
+
+
+def withdraw(building: Building) -> None:
+    """Mark that the form that was chosen is not delivered."""
+    for k in range(len(building.decisions)):
+        entry = building.decisions[k]
+        if entry.kind is DecisionKind.FORM and entry.outcome is Outcome.CHOSEN:
+            building.decisions[k] = dataclasses.replace(entry, outcome=Outcome.WITHDRAWN)

@@ -32,9 +32,8 @@ def first_valid(
 ) -> tuple[DrawnModel | None, tuple[int, ...]]:
     """The first model that is valid throughout, or None and the codes of all faults.
 
-    A model with a large face made level waits: it is taken unless a later one explains more roof points, of traced
-    faces by more than their number costs. Of those the first is taken whose faces stay near the points, else the one
-    that explains most.
+    A model with a large face made level waits: it is taken unless a later one explains more roof points than its
+    further faces cost. Of those the first is taken whose faces stay near the points, else the one that explains most.
     """
     decisions = building.decisions
     codes: set[int] = set()
@@ -69,24 +68,15 @@ def first_valid(
             return model, ()
         explained = explained_share(building, model)
         decisions.append(_tried(form, model, Outcome.OUTDONE, explained=explained))
-        needed = _further_cost(building, waiting, model) if form.name == TRACED and share >= _FEW_EXPLAINED else 0.0
-        if waiting is None or explained > share + needed:
+        is_mended = waiting is not None and waiting.contradiction is not None and model.contradiction is None
+        if waiting is not None and form.name == TRACED and share >= _FEW_EXPLAINED and not is_mended:
+            from pipeline.roof.traced_forms import further_cost
+
+            explained -= further_cost(waiting.parts, model.parts, building.roof, building.settings.plan)
+        if waiting is None or explained > share:
             waiting, share, at = model, explained, len(decisions) - 1
             if not model.is_levelled and stays_near(model.parts, building.roof):
-                decisions[at] = dataclasses.replace(decisions[at], outcome=Outcome.CHOSEN)
-                return model, ()
-
-
-def _further_cost(building: Building, before: DrawnModel | None, model: DrawnModel) -> float:
-    """Share of the roof points that the further faces and borders of a model cost; 0 if the one before contradicts."""
-    if before is None or (before.contradiction is not None and model.contradiction is None):
-        return 0.0
-    settings, cost = building.settings.plan, 0.0
-    for sign, one in ((1.0, model), (-1.0, before)):
-        faces = [face.polygon for part in one.parts for face in part.faces]
-        borders = 0.5 * math.fsum(face.length for face in faces) / building.roof.spacing_m
-        cost += sign * (settings.face_cost * len(faces) + settings.border_cost * borders)
-    return max(cost, 0.0) / len(building.roof.points)
+                remaining = iter(())
 
 
 def _tried(
@@ -111,14 +101,6 @@ def _tried(
         bic_margin=model.bic_margin,
         validity_codes=codes,
     )
-
-
-def withdraw(building: Building) -> None:
-    """Mark that the form that was chosen is not delivered."""
-    for k in range(len(building.decisions)):
-        entry = building.decisions[k]
-        if entry.kind is DecisionKind.FORM and entry.outcome is Outcome.CHOSEN:
-            building.decisions[k] = dataclasses.replace(entry, outcome=Outcome.WITHDRAWN)
 
 
 def too_few_points(building: Building, model: DrawnModel, lack: BuildingError | None) -> str:
@@ -156,7 +138,7 @@ def judged(building: Building, record: BuildingResult, plan: RoofPlan | None, mo
         return record
     if not is_finest or doubt.reason in NOT_OF_FORM:
         return record.doubted(doubt)
-    from pipeline.building.blocks import blocks
+    from pipeline.building.blocks import blocks, withdraw
 
     withdraw(building)
     block, _ = first_valid(blocks(building, plan), building)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Sequence
 from functools import partial
 
 import numpy as np
@@ -18,8 +19,9 @@ from pipeline.roof.footprint_in_mm import simpler_outlines
 from pipeline.roof.named_form import SIMPLER, TRACED, NamedForm
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.plan import RoofPlan, RoofPoints, min_face_area
-from pipeline.roof.roof_settings import RoofSettings
+from pipeline.roof.roof_settings import ArrangementSettings, RoofSettings
 from pipeline.roof.simplification import simplify_partition, unite_close_vertices
+from pipeline.roof.solid import SolidPart
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -100,6 +102,18 @@ def traced_forms(plan: RoofPlan, roof: RoofPoints, settings: RoofSettings) -> It
             simpler_plan = dataclasses.replace(plan, outline_mm=simpler)
             for form in plan_forms(simpler_plan, roof, settings):
                 yield dataclasses.replace(form, detail=f"{form.detail}, {SIMPLER}")
+
+
+def further_cost(
+    before: Sequence[SolidPart], after: Sequence[SolidPart], roof: RoofPoints, costs: ArrangementSettings
+) -> float:
+    """Share of the roof points that the further faces and borders of a model cost, as they do in an arrangement."""
+    cost = 0.0
+    for sign, parts in ((1.0, after), (-1.0, before)):
+        faces = [face.polygon for part in parts for face in part.faces]
+        borders_m = 0.5 * math.fsum(face.length for face in faces)
+        cost += sign * (costs.face_cost * len(faces) + costs.border_cost * borders_m / roof.spacing_m)
+    return max(cost, 0.0) / len(roof.points)
 
 
 def clip_partition(partition: RoofPartition, footprint_mm: MultiPolygon, min_area_m2: float) -> RoofPartition:

@@ -108,13 +108,12 @@ def detect_planes(points: FloatArray, spacing_m: float, settings: AdaptivePlaneS
     neighbours = nearest_neighbours(nodes, _NEIGHBOURS)
     coefficients, labels = _detect(points, nodes, node_of, neighbours, spacing_m, limits)
     sizes = np.bincount(labels[labels >= 0], minlength=1)
-    if sizes.sum() ** 2 >= _WAVES * (sizes * sizes).sum():
-        # neighbours on a wave say the same: their number proves no plane where half as many planes explain the points
+    if sizes.sum() ** 2 > _WAVES * (sizes * sizes).sum():
+        # neighbours on a wave say the same: their number proves no plane where half as many planes take the points
         wider = limits._replace(min_distance_m=settings.max_distance_m)
-        wide, wide_labels = _detect(points, nodes, node_of, neighbours, spacing_m, wider)
-        lost = np.count_nonzero(wide_labels < 0) - np.count_nonzero(labels < 0)
-        if 2 * len(wide) <= len(coefficients) and lost <= _PLANE_COST * (len(coefficients) - len(wide)):
-            coefficients, labels = wide, wide_labels
+        fewer, taken = _detect(points, nodes, node_of, neighbours, spacing_m, wider)
+        if 2 * len(fewer) <= len(coefficients) and (taken >= 0).sum() >= sizes.sum():
+            coefficients, labels = fewer, taken
     return DetectedPlanes(coefficients=coefficients, labels=labels)
 
 
@@ -310,10 +309,9 @@ def _numbered(points: FloatArray, labels: LabelArray, planes: FloatArray, min_co
     final = np.empty((count, 3))
     for k in range(count):
         a, b, c, fitted = best_fit_plane(sums[k])
+        final[k] = planes[old[k]]
         if fitted and cosine_of_slope(a, b) >= min_cosine:
             final[k, 0], final[k, 1], final[k, 2] = a, b, c
-        else:
-            final[k, 0], final[k, 1], final[k, 2] = planes[old[k], 0], planes[old[k], 1], planes[old[k], 2]
     return final
 
 

@@ -7,11 +7,12 @@ import pytest
 import shapely
 from candidates_by_hand import candidate
 
+from pipeline.building import form_search
 from pipeline.methods import ReconstructSettings
-from pipeline.model import Candidate, Plane, Reason, Status
+from pipeline.model import Candidate, Outcome, Plane, Reason, Status
 from pipeline.quality.validity import check_solid
 from pipeline.recipe import reconstruct_building
-from pipeline.roof import block
+from pipeline.roof import block, traced_forms
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.plan import RoofPoints
 from pipeline.roof.roof_settings import RoofSettings
@@ -49,6 +50,18 @@ def test_a_form_that_was_made_level_gives_way_to_one_that_explains_the_points(mo
     result = reconstruct_building(gable(), "arrangement", ReconstructSettings())
     assert (result.status, result.lod, len(drawn_forms)) == (Status.OK, "2.2", 2)
     assert result.rmse_m < 0.05
+
+
+@pytest.mark.parametrize(("share", "chosen"), [(0.81, "arrangement"), (0.9, "traced")])
+def test_traced_faces_have_to_explain_what_their_number_costs(
+    monkeypatch: pytest.MonkeyPatch, share: float, chosen: str
+) -> None:
+    shares = iter([0.8, 0.8, 0.8])
+    monkeypatch.setattr("pipeline.building.drawing.goes_far", lambda *_: True)
+    monkeypatch.setattr(form_search, "explained_share", lambda *_: next(shares, share))
+    monkeypatch.setattr(traced_forms, "further_cost", lambda *_: 0.05)
+    result = reconstruct_building(gable(), "arrangement", ReconstructSettings())
+    assert [entry.name for entry in result.decisions if entry.outcome is Outcome.CHOSEN] == [chosen]
 
 
 def test_a_level_face_through_slopes_is_not_delivered_as_a_roof(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -245,6 +245,32 @@ def test_a_parapet_stays_however_narrow(own_misfit: int, beside: int, faces: int
     assert united(plan, misfits, labels, face_limits(91_000, 91_000, 0.5)) == 1
 
 
+@pytest.mark.parametrize(("held", "faces"), [(0, 1), (1, 2)])
+def test_a_narrow_corner_without_a_point_joins_its_neighbour_however_short(held: int, faces: int) -> None:
+    plan = cut(5000)
+    corner = cell_at(plan, 4900.0, 100.0)
+    for x, y in ((4600, 0), (5000, 400)):
+        edge = edge_through(plan, x, y) if y == 0 else edge_up(plan, x)
+        assert insert_vertex(plan, edge, x, y)
+    last = int(plan.counts[0])
+    assert insert_chord(plan, last - 2, last - 1, corner, -1) == 1
+    is_small = cell_areas_m2(plan) < 1.0
+    labels, held_by = is_small.astype(np.int32), np.where(is_small, held, 100).astype(np.int32)
+    misfits = np.where(is_small[:, None] == np.array([False, True]), 0, 90_000)
+    pairs, weights = cell_borders(plan, 0.01, np.empty((0, 4)))
+    unite_faces(plan, misfits, held_by, pairs, weights, labels, face_limits(1000, 1000, 0.5))
+    assert connected_faces(labels, pairs)[1] == faces
+
+
+def edge_up(plan: Subdivision, x: int) -> int:
+    """The half-edge with a cell to its left that runs north along an inner border at x."""
+    for h in range(plan.counts[1]):
+        (x0, y0), (x1, y1) = plan.xy[plan.graph[h, ORIGIN]], plan.xy[plan.graph[h ^ 1, ORIGIN]]
+        if plan.graph[h, FACE] >= 0 and x0 == x == x1 and y0 < 400 < y1:
+            return h
+    raise AssertionError(x)
+
+
 def test_a_strip_without_a_neighbour_stays() -> None:
     xy = np.array([(0, 0), (400, 0), (400, 9000), (0, 9000), (2000, 0), (8000, 0), (8000, 9000), (2000, 9000)])
     apart = subdivision_of(xy, np.array([0, 4, 8]), np.array([0, 1]), 400)

@@ -138,6 +138,19 @@ def test_a_flat_roof_with_gravel_and_puddles_is_one_plane() -> None:
     assert (found.labels == 0).mean() > 0.98
 
 
+@pytest.mark.parametrize("density_per_m2", [2.0, 4.0])
+def test_the_waves_of_a_roof_are_no_planes_of_their_own(density_per_m2: float) -> None:
+    points = strewn(density_per_m2, 21)
+    points[:, 2] = 7 + 0.2 * np.sin(2 * np.pi / 6 * points[:, 0]) * np.cos(2 * np.pi / 6 * points[:, 1])
+    points[:, 2] += np.random.default_rng(22).normal(0, 0.02, len(points))
+    points = canonical(points)
+    narrow = AdaptivePlaneSettings(max_distance_m=DEFAULT.min_distance_m)
+    assert len(detected(points, narrow).coefficients) > 8
+    found = detected(points)
+    assert len(found.coefficients) == 1
+    assert (found.labels >= 0).mean() > 0.95
+
+
 @pytest.mark.parametrize("density_per_m2", [2.0, 8.0, 30.0])
 def test_a_dome_is_several_planes_and_no_swarm(density_per_m2: float) -> None:
     points = strewn(density_per_m2, 13)
