@@ -78,7 +78,7 @@ def _angles(around: FloatArray, count: int, turn: float) -> tuple[FloatArray, fl
     """The angles (count + 1,) between sectors, through corners of an outline that they nearly meet; reach of them."""
     away = np.hypot(around[:, 0], around[:, 1])
     step = 2.0 * math.pi / count
-    angles: FloatArray = (np.arange(count) + turn) * step
+    angles = np.asarray((np.arange(count) + turn) * step, np.float64)
     corners = np.arctan2(around[:, 1], around[:, 0]) % (2.0 * math.pi)
     corners = np.where(corners < (turn - 0.5) * step, corners + 2.0 * math.pi, corners)
     angles = _snapped(angles, corners, np.minimum(_NEAR_M / np.maximum(away, _NEAR_M), 0.3 * step))
