@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from plain_houses import houses, write_houses
 
-MOST_LINES = 39_400
+MOST_LINES = 39_380
 """Lines of the loaded modules of `pipeline` and `service`, whole files. Lower it whenever the number falls."""
 NAMED = 25
 """Largest modules that the failure names."""
