@@ -233,8 +233,8 @@ def dissolve_redundant(
     The noise of a large plane leaves clusters of its outliers, and the edge between two planes a plane across it. The
     worth of a plane is the sum over its points of (distance / limit)^2 to the nearest touching plane, at most 1, less
     the same to itself. A slope is worth nothing, either, if all that is left to it is one row of points along a contour
-    line, like that of a parapet: with points below the step any row makes a plane. Points of a plane that is given up take the
-    nearest touching plane, or none.
+    line, such as a parapet: with points below the step any row makes a plane. Points of a plane that is given up take
+    the nearest touching plane, or none.
 
     Parameters
     ----------
