@@ -462,7 +462,7 @@ class LodModel:
     lod: str
     """1.2, 1.3 or 2.0."""
     planes: tuple[Plane, ...]
-    """The horizontal planes that the roofs of the solids number."""
+    """The planes that the roofs of the solids number; horizontal below LoD2."""
     solids: tuple[Solid, ...]
     """Closed solids, one for each solid of the record's model, in the same order."""
 

@@ -11,7 +11,7 @@ import numpy as np
 from pipeline.building.drawing import Building, DrawnModel
 from pipeline.building.record import record_of
 from pipeline.errors import BuildingError
-from pipeline.methods import LODS
+from pipeline.methods import LODS, MAIN_ROOF
 from pipeline.model import BuildingResult, Decision, DecisionKind, Outcome, RoofFace
 from pipeline.quality.detection import confidence_of
 from pipeline.quality.residuals import vertical_residuals
@@ -69,11 +69,12 @@ def first_valid(
         explained = explained_share(building, model)
         decisions.append(_tried(form, model, Outcome.OUTDONE, explained=explained))
         is_mended = waiting is not None and waiting.contradiction is not None and model.contradiction is None
+        cost = 0.0
         if waiting is not None and form.name == TRACED and share >= _FEW_EXPLAINED and not is_mended:
             from pipeline.roof.traced_forms import further_cost
 
-            explained -= further_cost(waiting.parts, model.parts, building.roof, building.settings.plan)
-        if waiting is None or explained > share:
+            cost = further_cost(waiting.parts, model.parts, building.roof, building.settings.plan)
+        if waiting is None or explained - cost > share:
             waiting, share, at = model, explained, len(decisions) - 1
             if not model.is_levelled and stays_near(model.parts, building.roof):
                 remaining = iter(())
@@ -129,12 +130,13 @@ def explained_share(building: Building, model: DrawnModel) -> float:
 def judged(building: Building, record: BuildingResult, plan: RoofPlan | None, model: DrawnModel) -> BuildingResult:
     """A model as `ok` or `doubtful`, or a block that explains the points as well; a coarser model by its finest."""
     settings, is_finest = building.settings.support, record.lod == LODS[-1]
+    has_slopes = record.lod >= MAIN_ROOF  # coarser models do not claim to lie on their points
     finest = record if is_finest else record_of(building, model)
-    doubt = model.contradiction if is_finest else None
+    doubt = model.contradiction if has_slopes else None
     doubt = doubt or doubt_of(support_of(finest, building.candidate), settings)
-    if not is_finest:  # a coarser model does not claim to lie on its points
+    if not is_finest:
         record = dataclasses.replace(record, replaced_confidence=confidence_of(finest))
-    if doubt is None or not (is_finest or doubt.reason in NOT_OF_ROOF):
+    if doubt is None or not (has_slopes or doubt.reason in NOT_OF_ROOF):
         return record
     if not is_finest or doubt.reason in NOT_OF_FORM:
         return record.doubted(doubt)

@@ -356,7 +356,7 @@ BUILDINGS = (
         "why a model has no solids in LoD2.3, from a closed list; null if it has, and if they are not requested",
         page="../methods/overhangs.md#buildings-without-lod23",
     ),
-    Column("n_boxes", INT32, COUNT, "number of `boxes`; null if they are not requested"),
+    Column("n_boxes", INT32, COUNT, "number of `boxes`; null if they are not requested, and without a model in LoD2.2"),
     Column(
         "guides_followed",
         INT32,

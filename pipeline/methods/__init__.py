@@ -15,7 +15,8 @@ from pipeline.roof.roof_settings import ArrangementSettings, GuideSettings, Roof
 if TYPE_CHECKING:
     from pipeline.model import PreparedCloud, Segmentation
 
-LODS = ("1.2", "1.3", "2.0", "2.2")
+MAIN_ROOF = "2.0"
+LODS = ("1.2", "1.3", MAIN_ROOF, "2.2")
 """Levels of detail (Biljecki, Ledoux and Stoter 2016): one block, level parts, the main roof, all roof faces."""
 OVERHANGS = "2.3"
 """The level of detail with overhangs, always beside 2.2: where there are none, or they cannot be drawn, it is empty."""
@@ -129,21 +130,27 @@ class ReconstructSettings:
     """Levels of detail to be modelled, of `LODS` and in their order, then `OVERHANGS` if it is asked for."""
 
     def __post_init__(self) -> None:
-        """Overhangs take LoD2.2 and the walls beneath the eaves; raises SettingsError if no walls are looked for."""
-        if OVERHANGS not in self.lods:
-            return
-        faults = [
-            f"lods has {OVERHANGS}, and {name} is {value}: use {wanted}, or leave {OVERHANGS} out"
-            for name, value, wanted in (
-                ("outline", repr(self.roof.outline), "'eaves'"),
-                ("straight_eaves", str(self.roof.straight_eaves).lower(), "true"),
-            )
-            if str(value).strip("'") != wanted.strip("'")
-        ]
+        """Overhangs take LoD2.2 and the walls beneath the eaves; raises SettingsError if no walls are looked for.
+
+        So it does where boxes are asked for, but no level of detail has them.
+        """
+        faults = []
+        if self.roof.superstructures and not {LODS[-1], OVERHANGS} & set(self.lods):
+            faults.append(f"superstructures is true, and lods has no {LODS[-1]}, which shows them: add it")
+        if OVERHANGS in self.lods:
+            faults += [
+                f"lods has {OVERHANGS}, and {name} is {value}: use {wanted}, or leave {OVERHANGS} out"
+                for name, value, wanted in (
+                    ("outline", repr(self.roof.outline), "'eaves'"),
+                    ("straight_eaves", str(self.roof.straight_eaves).lower(), "true"),
+                )
+                if str(value).strip("'") != wanted.strip("'")
+            ]
         if faults:
             raise SettingsError(faults)
-        object.__setattr__(self, "lods", (*sorted({*self.lods, LODS[-1]} - {OVERHANGS}), OVERHANGS))
-        object.__setattr__(self, "roof", dataclasses.replace(self.roof, wall_outline=True))
+        if OVERHANGS in self.lods:
+            object.__setattr__(self, "lods", (*sorted({*self.lods, LODS[-1]} - {OVERHANGS}), OVERHANGS))
+            object.__setattr__(self, "roof", dataclasses.replace(self.roof, wall_outline=True))
 
     @property
     def record_lods(self) -> tuple[str, ...]:

@@ -17,7 +17,8 @@ _LEVEL_ALONG, _LARGE, _MOST_TURN_DEG = 0.05, 0.04, 35.0
 """Slope of the planes of a barrel along its axis; the turn from one large plane to the next, by its share of points."""
 _TOUCHING_M = 0.15
 """Distance of the planes of a curve from a sphere that they touch; a cone's has radius 0, one of many in a barrel."""
-_ROUNDS = 4
+_ROUNDS, _LEAST = 4, 1e-9
+"""Rounds of robust least squares; what is added to its squares, since planes of one tent touch many spheres."""
 
 
 def may_be_curved(planes: Sequence[Plane], labels: LabelArray) -> bool:
@@ -45,8 +46,8 @@ def may_be_curved(planes: Sequence[Plane], labels: LabelArray) -> bool:
         return along < _LEVEL_ALONG**2 and bool(turns.max(initial=0.0) <= _MOST_TURN_DEG)
     touching, weights = np.column_stack([a, b, -np.ones(len(a)), -size]) / size[:, None], share
     for _ in range(_ROUNDS):
-        root = np.sqrt(weights)
-        sphere = np.linalg.lstsq(touching * root[:, None], -c / size * root, rcond=None)[0]
+        square = np.einsum("i,ij,ik->jk", weights, touching, touching) + _LEAST * np.eye(4)
+        sphere = np.linalg.solve(square, -np.einsum("i,ij,i->j", weights, touching, c / size))
         away = np.abs(np.sum(touching * sphere, axis=1) + c / size)
         weights = share / (1.0 + (away / _TOUCHING_M) ** 2)
     return float(share[away < _TOUCHING_M].sum()) >= _MOST

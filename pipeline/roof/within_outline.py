@@ -1,7 +1,7 @@
 """Roof faces that lie exactly within an outline that other buildings touch, on the millimetre grid.
 
 New vertices on the outline are rounded to the grid, and vertices of the outline that bend its edges by a millimetre may
-be missing: then an edge of the faces is_out the outline by as much. Such vertices move to the nearest place inside, and
+be missing: then an edge of the faces leaves the outline by as much. Such vertices move to the nearest place inside, and
 edges take the outline's vertices beside them. Faces that reach far beyond the outline are cut.
 """
 

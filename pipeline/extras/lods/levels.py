@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from pipeline.building.drawing import Building, DrawnModel
 from pipeline.building.record import record_of
 from pipeline.extras.lods.lower_lods import lower_lods
+from pipeline.methods import MAIN_ROOF
 from pipeline.model import BuildingResult, Decision, DecisionKind, LodModel, Outcome
 from pipeline.quality.validity import check_solid
 from pipeline.roof.solid import LodParts, renumbered
@@ -56,7 +57,7 @@ def _levels(lods: Sequence[str], models: Sequence[LodParts]) -> Iterator[Decisio
 def _lod_model(model: LodParts, number: dict[int, int]) -> LodModel:
     """A coarser model as it is delivered; `number` is that of each plane in the record, which LoD2.0 shares."""
     solids, planes = tuple(part.solid for part in model.parts), tuple(model.planes)
-    if model.lod == "2.0":
+    if model.lod == MAIN_ROOF:
         solids = tuple(renumbered(solid, number) for solid in solids)
         planes = tuple(model.planes[plane] for plane in number)
     return LodModel(lod=model.lod, planes=planes, solids=solids)

@@ -18,6 +18,7 @@ from shapely import MultiPolygon
 
 from pipeline.errors import BuildingError
 from pipeline.extras.lods.main_roof import main_planes
+from pipeline.methods import MAIN_ROOF
 from pipeline.model import FloatArray, Plane, RoofFace, Solid
 from pipeline.roof.block import block_plane
 from pipeline.roof.footprint import polygons_of
@@ -68,7 +69,7 @@ def lower_lods(
     """
     whole = block_plane(points, ground_z_m, settings.block_height_percentile)
     forms: Mapping[str, Callable[[SolidPart], Iterator[LevelPart]]] = {
-        "2.0": lambda part: main_roof_forms(part, detailed.planes, ground_z_m, outline_mm),
+        MAIN_ROOF: lambda part: main_roof_forms(part, detailed.planes, ground_z_m, outline_mm),
         "1.3": lambda part: level_forms(part, points, whole, ground_z_m, settings, outline_mm),
         "1.2": lambda part: block_forms(part, whole, ground_z_m, outline_mm),
     }
@@ -80,7 +81,7 @@ def lower_lods(
             next((form for form in drawn(part) if is_sound(form.solid_part.solid)), None) for part in detailed.parts
         ]
         found = [form for form in sound if form is not None]
-        if len(found) == len(detailed.parts) and lod == "2.0":
+        if len(found) == len(detailed.parts) and lod == MAIN_ROOF:
             models.append(LodParts(lod=lod, parts=[form.solid_part for form in found], planes=detailed.planes))
         elif len(found) == len(detailed.parts):
             models.append(_numbered_through(lod, found))

@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-import numpy as np
 import shapely
 
 from pipeline.model import Plane, RoofFace
@@ -17,8 +16,8 @@ Pair = tuple[int, int]
 
 _MAX_SHARE = 0.25
 """What stands on a face is smaller than this share of it."""
-_BELOW_M = 0.15
-"""Its faces lie nowhere deeper beneath the plane."""
+_BELOW_M, _ABOVE_M = 0.15, 5.0
+"""Its faces lie nowhere deeper beneath the plane, nor higher above it: a tower is no dormer."""
 _MIN_AROUND = 0.5
 """Share of its border that it has with the face; wings have more with the outline and with other faces."""
 
@@ -40,7 +39,7 @@ def main_planes(faces: Sequence[RoofFace], planes: Sequence[Plane], border_mm: M
             if k not in main
             and area[k] <= _MAX_SHARE * area[host]
             and faces[k].plane != number
-            and _is_above(faces[k], planes[number])
+            and _stands_on(faces[k], planes[number])
         ]
         for group in _connected(small, border_mm):
             inside = math.fsum(length for (a, b), length in border_mm.items() if a in group and b in group)
@@ -55,10 +54,11 @@ def main_planes(faces: Sequence[RoofFace], planes: Sequence[Plane], border_mm: M
     return [main.get(k, face.plane) for k, face in enumerate(faces)]
 
 
-def _is_above(face: RoofFace, plane: Plane) -> bool:
-    """Whether no corner of a face lies deep beneath a plane."""
+def _stands_on(face: RoofFace, plane: Plane) -> bool:
+    """Whether no corner of a face lies deep beneath a plane, or far above it."""
     x, y, z = shapely.get_coordinates(face.polygon, include_z=True).T
-    return bool(np.min(z - (plane.a * x + plane.b * y + plane.c)) >= -_BELOW_M)
+    above = z - (plane.a * x + plane.b * y + plane.c)
+    return bool(above.min() >= -_BELOW_M and above.max() <= _ABOVE_M)
 
 
 def _connected(members: Sequence[int], border_mm: Mapping[Pair, float]) -> list[set[int]]:

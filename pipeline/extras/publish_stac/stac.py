@@ -38,6 +38,7 @@ from pipeline.extras.publish.finished_run import (
 )
 from pipeline.io import LocalStorage, arrow_at, is_url, storage_at
 from pipeline.io.formats import ENCODINGS
+from pipeline.methods import LODS, OVERHANGS
 from pipeline.runtime.manifest import InputFile, RunManifest
 from pipeline.runtime.monitoring.progress import Event, Listener, ignore
 
@@ -67,8 +68,10 @@ ASSETS: Mapping[str, tuple[str, str, str]] = {
     "cityjson": ("application/city+json-seq", "data", "CityJSONSeq 2.0: solids with semantic surfaces"),
     "terrain": ("application/city+json-seq", "data", "CityJSONSeq 2.0: the terrain as triangles"),
     "mesh": ("", "data", "the meshes of all buildings"),
-    "mesh-lod12": ("", "data", "the meshes of all buildings in LoD1.2"),
-    "mesh-lod13": ("", "data", "the meshes of all buildings in LoD1.3"),
+    **{
+        f"mesh-lod{lod.replace('.', '')}": ("", "data", f"the meshes of all buildings in LoD{lod}")
+        for lod in (*LODS[:-1], OVERHANGS)
+    },
 }
 """Media type, role and title of the assets of an Item; meshes have the type of their ending."""
 _MESHES = {".glb": "model/gltf-binary", ".obj": "model/obj"}

@@ -78,7 +78,8 @@ def box_solid(box: FoundBox, faces: Sequence[RoofFace], planes: Sequence[Plane])
         solid = _upside_down(polygons, labels, mirrored, top_z_m)
         if any(_is_step(face, solid) for face in solid.faces):
             foot = dataclasses.replace(planes[0], a=0.0, b=0.0, c=_highest_foot(solid))
-            solid = _upside_down([rectangle], [0], [foot], top_z_m)
+            inside = polygons_of(shapely.union_all(polygons, grid_size=1.0))
+            solid = _upside_down([max(inside, key=lambda part: part.area)], [0], [foot], top_z_m)
     except BuildingError:
         return None
     if top_z_m + _highest_foot(solid) < _MIN_OVER_M:

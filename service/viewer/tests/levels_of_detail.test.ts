@@ -1,11 +1,11 @@
 import { expect, test } from "vitest";
 import { levelShown, levelsOffered, levelWords, lodsInput } from "../src/models/levels_of_detail";
 
-const SETS = ["1.2", "1.3", "2.2", "1.2,1.3", "1.2,2.2", "1.3,2.2", "1.2,1.3,2.2"]; // of the process description
+const SETS = ["1.2", "1.3", "2.0", "2.2", "1.2,1.3", "1.2,2.2", "1.3,2.2", "2.0,2.2", "1.2,1.3,2.2", "1.2,1.3,2.0,2.2"]; // some of the process description
 
 test("of the sets that the process takes each level is offered once, coarse to fine", () => {
-  expect(levelsOffered(SETS)).toEqual(["1.2", "1.3", "2.2"]);
-  expect(levelsOffered([...SETS].reverse())).toEqual(["1.2", "1.3", "2.2"]);
+  expect(levelsOffered(SETS)).toEqual(["1.2", "1.3", "2.0", "2.2"]);
+  expect(levelsOffered([...SETS].reverse())).toEqual(["1.2", "1.3", "2.0", "2.2"]);
   for (const lod of levelsOffered(SETS)) expect(levelWords(lod)).not.toBe("");
 });
 
@@ -13,6 +13,7 @@ test("what is chosen is one of the sets that the process takes, in whatever orde
   expect(lodsInput(["2.2"])).toBe("2.2");
   expect(lodsInput(["2.2", "1.2", "1.3", "1.2"])).toBe("1.2,1.3,2.2");
   for (const set of SETS) expect(SETS).toContain(lodsInput(set.split(",").reverse()));
+  expect(lodsInput(["2.2", "2.0"])).toBe("2.0,2.2");
   expect(lodsInput([])).toBe("");
 });
 

@@ -1,6 +1,8 @@
 """Which of several sound forms of a roof is delivered."""
 
+import types
 from collections.abc import Sequence
+from typing import cast
 
 import numpy as np
 import pytest
@@ -8,14 +10,17 @@ import shapely
 from candidates_by_hand import candidate
 
 from pipeline.building import form_search
+from pipeline.building.drawing import Building, DrawnModel
 from pipeline.methods import ReconstructSettings
 from pipeline.model import Candidate, Outcome, Plane, Reason, Status
 from pipeline.quality.validity import check_solid
 from pipeline.recipe import reconstruct_building
 from pipeline.roof import block, traced_forms
+from pipeline.roof.named_form import ARRANGEMENT, TRACED, NamedForm
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.plan import RoofPoints
 from pipeline.roof.roof_settings import RoofSettings
+from pipeline.roof.solid import solid_parts
 from pipeline.roof.unsupported_faces import level_unsupported_faces
 
 
@@ -62,6 +67,29 @@ def test_traced_faces_have_to_explain_what_their_number_costs(
     monkeypatch.setattr(traced_forms, "further_cost", lambda *_: 0.05)
     result = reconstruct_building(gable(), "arrangement", ReconstructSettings())
     assert [entry.name for entry in result.decisions if entry.outcome is Outcome.CHOSEN] == [chosen]
+
+
+def test_a_form_is_chosen_by_what_it_explains_whatever_the_faces_before_it_cost(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    shares, costs = {"a": 0.90, "b": 0.95, "c": 0.93}, iter([0.03, 0.0])
+    forms = {name: levelled_model() for name in shares}
+    names = {id(model): name for name, model in forms.items()}
+    monkeypatch.setattr(form_search, "explained_share", lambda _, model: shares[names[id(model)]])
+    monkeypatch.setattr(form_search, "stays_near", lambda *_: False)
+    monkeypatch.setattr(traced_forms, "further_cost", lambda *_: next(costs))
+    models = [NamedForm(TRACED if name > "a" else ARRANGEMENT, lambda name=name: forms[name]) for name in shares]
+    building = types.SimpleNamespace(decisions=[], roof=None, settings=types.SimpleNamespace(plan=None))
+    chosen, _ = form_search.first_valid(models, cast("Building", building))
+    assert chosen is forms["b"]
+
+
+def levelled_model() -> DrawnModel:
+    """A sound block that counts as levelled."""
+    outline_mm = shapely.MultiPolygon([shapely.box(0, 0, 9_000, 9_000)])
+    plane = Plane(a=0.0, b=0.0, c=6.0, n_points=9, rmse_m=0.0)
+    partition = RoofPartition(polygons=tuple(outline_mm.geoms), labels=np.zeros(1, np.int32))
+    return DrawnModel(lod="2.2", parts=solid_parts(partition, [plane], 0.0), planes=[plane], is_levelled=True)
 
 
 def test_a_level_face_through_slopes_is_not_delivered_as_a_roof(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,8 +9,20 @@ from candidates_by_hand import candidate
 from method_by_hand import MethodByHand
 
 from pipeline.errors import SettingsError
+from pipeline.extras.lods.main_roof import main_planes
 from pipeline.methods import LODS, ReconstructSettings
-from pipeline.model import BuildingResult, Candidate, PreparedCloud, Reason, RoofType, Segmentation, Status
+from pipeline.model import (
+    BuildingResult,
+    Candidate,
+    Doubt,
+    Plane,
+    PreparedCloud,
+    Reason,
+    RoofFace,
+    RoofType,
+    Segmentation,
+    Status,
+)
 from pipeline.parameters import Parameters
 from pipeline.quality.validity import check_solid
 from pipeline.recipe import reconstruct_building
@@ -102,6 +114,33 @@ def test_settings_name_the_levels_and_change_the_hash() -> None:
     assert some.settings_hash != RunSettings.from_mapping({}).settings_hash
     with pytest.raises(SettingsError, match=r"lods is '2\.2,1\.2': use one of 1\.2, 1\.3, 2\.0, 2\.2, 2\.3, 1\.2,1\.3"):
         RunSettings.from_mapping({"lods": "2.2,1.2"})
+
+
+def test_boxes_need_the_level_that_shows_them() -> None:
+    with pytest.raises(SettingsError, match=r"superstructures is true, and lods has no 2\.2"):
+        RunSettings.from_mapping({"lods": "1.3,2.0", "roof": {"superstructures": True}})
+    assert RunSettings.from_mapping(
+        {"lods": "2.0,2.2", "roof": {"superstructures": True}}
+    ).building.roof.superstructures
+
+
+@pytest.mark.parametrize(("lod", "status"), [("2.2", Status.DOUBTFUL), ("2.0", Status.DOUBTFUL), ("1.3", Status.OK)])
+def test_slopes_that_points_do_not_support_are_doubtful_without_dormers_too(
+    monkeypatch: pytest.MonkeyPatch, lod: str, status: Status
+) -> None:
+    doubt = Doubt.of(Reason.POOR_FIT, "on purpose", "share_within", 0.1, 0.7)
+    monkeypatch.setattr("pipeline.building.form_search.doubt_of", lambda *_: doubt)
+    assert modelled(house(), lod).status is status
+
+
+@pytest.mark.parametrize(("top_m", "main"), [(8.5, [0, 0]), (36.0, [0, 1])])
+def test_a_tower_is_no_dormer(top_m: float, main: list[int]) -> None:
+    levels = (6.0, top_m)
+    tower = shapely.box(4, 4, 12, 12)
+    shapes = (shapely.box(0, 0, 20, 20).difference(tower), tower)
+    faces = [RoofFace(plane=k, polygon=shapely.force_3d(shape, levels[k])) for k, shape in enumerate(shapes)]
+    planes = [Plane(a=0.0, b=0.0, c=level, n_points=9, rmse_m=0.0) for level in levels]
+    assert main_planes(faces, planes, {(0, 1): 32_000.0}) == main
 
 
 def test_the_main_roof_has_no_dormer_and_its_planes_are_those_of_the_record() -> None:

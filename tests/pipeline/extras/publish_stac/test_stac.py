@@ -239,7 +239,8 @@ def test_the_collection_describes_every_column(run_dir: Path, tmp_path: Path) ->
 def test_meshes_of_whole_tiles_are_assets(run_dir: Path, tmp_path: Path) -> None:
     storage = storage_at(run_dir)
     state = json.loads(storage.get("state/t1.json"))
-    for name in ("meshes/t1/t1.glb", "meshes/t1/t1-lod12.glb", "meshes/t1/abc.obj"):
+    lods = ("12", "13", "20", "23")
+    for name in ("meshes/t1/t1.glb", "meshes/t1/abc.obj", *(f"meshes/t1/t1-lod{lod}.glb" for lod in lods)):
         storage.put(name, b"x")
         state["files"][name] = "0" * 64
     storage.put("state/t1.json", json.dumps(state).encode())
@@ -247,7 +248,7 @@ def test_meshes_of_whole_tiles_are_assets(run_dir: Path, tmp_path: Path) -> None
     assets = validated(tmp_path / "out" / "t1" / "t1.json")["assets"]
     assert {name: one["type"] for name, one in assets.items() if "mesh" in name} == {
         "mesh": "model/gltf-binary",
-        "mesh-lod12": "model/gltf-binary",
+        **{f"mesh-lod{lod}": "model/gltf-binary" for lod in lods},
     }
 
 

@@ -161,6 +161,9 @@ def test_across_a_step_a_box_stands_on_the_higher_side() -> None:
     assert check_solid(solid) == ()
     assert solid.vertices[:, 2].min() == pytest.approx(5.0, abs=0.01)
     assert box_solid(box_at(5.5, 2.0, 6.5, 3.0, 5.1), (lower, upper), planes) is None
+    at_the_outline = box_solid(box_at(5.5, 7.4, 6.5, 8.2, 6.0), (lower, upper), planes)
+    assert at_the_outline is not None
+    assert at_the_outline.vertices[:, 1].max() == 8.0
 
 
 def test_a_box_ends_at_the_outline() -> None:
