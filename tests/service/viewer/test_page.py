@@ -233,11 +233,12 @@ def test_levels_of_detail_are_chosen_for_the_job_and_in_the_view(
     opened.drop(house)
     page.locator("summary", has_text="Options").click()
     boxes = page.get_by_role("group", name="Levels of detail").get_by_role("checkbox")
-    names = ["LoD1.2: one block", "LoD1.3: level parts", "LoD2.2: roof faces", "LoD2.3: roof faces with overhangs"]
-    expect(boxes.locator("..")).to_have_text(names)
-    assert [box.is_checked() for box in boxes.all()] == [False, False, True, False]
+    names = ["one block", "level parts", "main roof", "roof faces", "roof faces with overhangs"]
+    levels = ["LoD1.2", "LoD1.3", "LoD2.0", "LoD2.2", "LoD2.3"]
+    expect(boxes.locator("..")).to_have_text([f"{lod}: {name}" for lod, name in zip(levels, names, strict=True)])
+    assert [box.is_checked() for box in boxes.all()] == [False, False, False, True, False]
     button = page.locator("button[type=submit]")
-    boxes.nth(2).uncheck()
+    boxes.nth(3).uncheck()
     expect(button).to_have_text("Choose a level of detail")
     expect(button).to_have_attribute("aria-disabled", "true")
     other = page.get_by_role("checkbox", name="kmeans", exact=True)
@@ -245,17 +246,17 @@ def test_levels_of_detail_are_chosen_for_the_job_and_in_the_view(
     expect(boxes.first).to_be_hidden()
     expect(button).to_have_text("Compare 2 methods")
     other.uncheck()
-    for box in reversed(boxes.all()[:3]):
+    for box in reversed(boxes.all()[:4]):
         box.check()
     with page.expect_request("**/execution") as sent:
         button.click()
-    assert json.loads(sent.value.post_data or "")["inputs"]["lods"] == "1.2,1.3,2.2"
+    assert json.loads(sent.value.post_data or "")["inputs"]["lods"] == "1.2,1.3,2.0,2.2"
 
     opened.wait_for_models()
     page.locator(".building").first.click()
     expect(page.locator(".record dl").first).to_be_visible()
     choice = page.locator(".tools").get_by_role("group", name="Level of detail").get_by_role("button")
-    expect(choice).to_have_text(["LoD1.2", "LoD1.3", "LoD2.2"])
+    expect(choice).to_have_text(levels[:4])
     expect(choice.last).to_have_attribute("aria-pressed", "true")
     page.get_by_role("button", name="Fit").click()
     roof = opened.pixels_at_rest()
