@@ -94,7 +94,7 @@ def test_features_have_the_ids_columns_and_geometries_of_the_table(served: Serve
         if own is not None:
             assert own.normalize() == shown.normalize()
             assert shapely.has_z(own) == shapely.has_z(shown)
-        left_out = {"geometry", "bbox", "wall_outline"}
+        left_out = {"geometry", "bbox", "wall_outline", "boxes"}
         expected = {k: v for k, v in row.items() if k not in left_out and not k.startswith("solid")}
         times = {k: v.isoformat().replace("+00:00", "Z") for k, v in expected.items() if hasattr(v, "isoformat")}
         assert feature["properties"] == expected | times
@@ -472,6 +472,7 @@ def test_gdal_reads_a_served_run_with_ids_and_types_of_the_tables(tmp_path: Path
                 "bbox",
                 "geometry",
                 "wall_outline",
+                "boxes",
                 *(name for name in stored.column_names if name.startswith("solid")),
             }
             assert set(stored.column_names) - gone <= set(found.column_names)
