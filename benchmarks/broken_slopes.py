@@ -18,13 +18,12 @@ from __future__ import annotations
 import dataclasses
 import math
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 import shapely
 
-from benchmarks.entries import markdown_table
 from benchmarks.suite_surveys import asked, by_checkout, measured
 from pipeline.model import BoolArray
 from pipeline.ruler.evaluation.building_matching import MIN_SHARE, mostly_on, one_to_one, overlapping, sound_polygons
@@ -39,6 +38,8 @@ from pipeline.ruler.simulation.sweep import Cell
 MAX_ANGLE_DEG, MAX_OFFSET_M = 5.0, 0.15
 LEAST_M2, LEAST_POINTS, LEAST_SPACINGS = 1.0, MIN_FACE_POINTS, 2.0
 """Least area in plan, points on it, and width of a face that counts."""
+
+HEADS = ["all faces right", "faces found", "of faces right", "wrong per roof", "named"]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -113,14 +114,6 @@ def line(name: str, rows: Sequence[Judged]) -> list[str]:
     return [name, str(len(rows)), *(f"{share:.3f}" for share in shares), f"{wrong / len(rows):.2f}", f"{named:.3f}"]
 
 
-def table(rows: Sequence[Judged], key: Callable[[Judged], str]) -> str:
-    """A line per value of a key, in their order, and one of all."""
-    names = list(dict.fromkeys(map(key, rows)))
-    lines = [line(name, [row for row in rows if key(row) == name]) for name in names]
-    heads = ["", "roofs", "all faces right", "faces found", "of faces right", "wrong per roof", "named"]
-    return markdown_table(heads, [*lines, line("all", rows)])
-
-
 def main() -> int:
     """Measure and print."""
     given, codes = asked(__doc__)
@@ -128,7 +121,7 @@ def main() -> int:
     def judge(run: Path, truth: Path, cell: Cell) -> list[Judged]:
         return list(judged(read_models(run).models, read_models(truth).models, cell.density_per_m2))
 
-    by_checkout(measured(given, codes, "broken_slopes", CELLS, judge), codes, given.split, table)
+    by_checkout(measured(given, codes, "broken_slopes", CELLS, judge), codes, given.split, HEADS, line)
     return 0
 
 

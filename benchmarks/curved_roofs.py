@@ -16,14 +16,13 @@ from __future__ import annotations
 import dataclasses
 import math
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
 
-from benchmarks.entries import markdown_table
 from benchmarks.suite_surveys import asked, by_checkout, measured
 from pipeline.ruler.evaluation.building_matching import overlapping, sound_polygons
 from pipeline.ruler.evaluation.models import RoofModel
@@ -31,6 +30,8 @@ from pipeline.ruler.evaluation.reading import read_models
 from pipeline.ruler.simulation.curved_roofs import CELLS
 from pipeline.ruler.simulation.roofs import ROOF_TYPES, CurvedForm
 from pipeline.ruler.simulation.sweep import Cell
+
+HEADS = ["named", "residuals over noise", "90 %", "faces", "ok"]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -90,14 +91,6 @@ def line(name: str, rows: Sequence[Judged]) -> list[str]:
     return [name, str(len(rows)), f"{named:.3f}", f"{median:.2f}", f"{most:.2f}", f"{faces:.0f}", f"{sound:.3f}"]
 
 
-def table(rows: Sequence[Judged], key: Callable[[Judged], str]) -> str:
-    """A line per value of a key, in their order, and one of all."""
-    names = list(dict.fromkeys(map(key, rows)))
-    lines = [line(name, [row for row in rows if key(row) == name]) for name in names]
-    heads = ["", "roofs", "named", "residuals over noise", "90 %", "faces", "ok"]
-    return markdown_table(heads, [*lines, line("all", rows)])
-
-
 def main() -> int:
     """Measure and print."""
     given, codes = asked(__doc__)
@@ -108,7 +101,7 @@ def main() -> int:
         records = {row["building_id"]: row for row in rows}
         return list(judged(read_models(run).models, read_models(truth).models, records))
 
-    by_checkout(measured(given, codes, "curved_roofs", CELLS, judge), codes, given.split, table)
+    by_checkout(measured(given, codes, "curved_roofs", CELLS, judge), codes, given.split, HEADS, line)
     return 0
 
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import shapely
 
-from benchmarks.entries import Entry
+from benchmarks.entries import Entry, markdown_table
 from benchmarks.survey_runs import ROOT, run_survey
 from pipeline.extras.compare.compare import Variant
 from pipeline.ruler.evaluation.reading import read_models
@@ -24,6 +24,8 @@ from pipeline.settings import RunSettings
 
 REQUIRED = Cell(density_per_m2=8.0, noise_m=0.02)
 """The survey of the required figures."""
+Line = Callable[[str, Sequence[Any]], list[str]]
+"""Makes a line of a table from a name and rows: the name, their number, and a figure for each head."""
 
 
 def write_outlines(truth: Path, path: Path) -> None:
@@ -95,14 +97,24 @@ def measured(
     return rows
 
 
-def by_checkout(
-    rows: Sequence[Any], codes: dict[str, Path], split: str, table: Callable[[Sequence[Any], Callable[[Any], str]], str]
-) -> None:
+def table(
+    rows: Sequence[Any],
+    key: Callable[[Any], str],
+    heads: Sequence[str],
+    line: Callable[[str, Sequence[Any]], list[str]],
+) -> str:
+    """A line per value of a key, in their order, and one of all."""
+    names = list(dict.fromkeys(map(key, rows)))
+    lines = [line(name, [row for row in rows if key(row) == name]) for name in names]
+    return markdown_table(["", "roofs", *heads], [*lines, line("all", rows)])
+
+
+def by_checkout(rows: Sequence[Any], codes: dict[str, Path], split: str, heads: Sequence[str], line: Line) -> None:
     """Print the rows of each checkout by survey, and those of the required survey by form."""
     for code in codes:
         own = [row for row in rows if row.code == code]
         required = [row for row in own if (row.per_m2, row.noise_m) == (REQUIRED.density_per_m2, REQUIRED.noise_m)]
         print(f"{code}, {split} seeds, by survey:\n")
-        print(table(own, lambda row: f"{row.per_m2:g} per m2, {100 * row.noise_m:g} cm"))
+        print(table(own, lambda row: f"{row.per_m2:g} per m2, {100 * row.noise_m:g} cm", heads, line))
         print(f"{code}, at {REQUIRED.density_per_m2:g} per m2 and {100 * REQUIRED.noise_m:g} cm, by form:\n")
-        print(table(required, lambda row: row.form))
+        print(table(required, lambda row: row.form, heads, line))

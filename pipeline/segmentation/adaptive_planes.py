@@ -57,7 +57,7 @@ _VOTING_PASSES = 3
 _PLANE_COST = 5.0
 """Points that would be unexplained without a plane for it to stay."""
 _ROW_SPACINGS, _ROW_M = 1.5, 0.6
-"""Extent of one row of points: where they are sparse, the slopes of houses are no wider than a few rows."""
+"""Largest extent of one row of points in plan. In sparse points a whole slope may have only a few rows."""
 _ROUNDS = 2
 """Rounds of regression, merging and assignment: labels hardly change later."""
 _WAVES = 8.0

@@ -285,7 +285,7 @@ def dissolve_redundant(
             if worth > 4.0 * plane_cost and high - low >= row_m * steep:
                 break
         is_row = own_points > 0 and steep > _LEVEL and high - low < row_m * steep
-        if worth >= plane_cost and not (is_row and off >= _STEP * distance_m * own_points):
+        if worth >= plane_cost and not (is_row and _STEP * distance_m * own_points <= off < np.inf):
             continue
         usable[k] = False
         for m in range(begin[k], begin[k + 1]):

@@ -1,4 +1,4 @@
-"""Parts of a roof that are no buildings: what is small, enclosed by another part, or its annex joins that."""
+"""Parts of a roof that join another part: small ones, those that it encloses, and its annexes."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ Pair = tuple[int, int]
 _MAX_SHARE = 0.25
 """What stands on a face is smaller than this share of it."""
 _BELOW_M, _ABOVE_M = 0.15, 5.0
-"""Its faces lie nowhere deeper beneath the plane, nor higher above it: a tower is no dormer."""
+"""How far its faces may lie below the plane and above it; a tower rises farther."""
 _MIN_AROUND = 0.5
 """Share of its border that it has with the face; wings have more with the outline and with other faces."""
 

@@ -12,20 +12,17 @@ from collections.abc import Callable
 import numpy as np
 
 from pipeline.ruler.simulation.envelope import Line, Place, RoofPart
-from pipeline.ruler.simulation.plots import PlannedRoof, packed_plots
+from pipeline.ruler.simulation.plots import scene_of_forms
 from pipeline.ruler.simulation.random_dimensions import random_dimensions
 from pipeline.ruler.simulation.roof_parts import PARTS, rectangle
 from pipeline.ruler.simulation.roofs import BrokenForm, RoofShape
-from pipeline.ruler.simulation.simulated_scene import Scene, undulating_terrain
+from pipeline.ruler.simulation.simulated_scene import Scene
 from pipeline.ruler.simulation.sweep import Cell
 
-OF_EACH = 4
-"""Buildings of each form in a scene."""
 DENSITIES_PER_M2 = (2.0, 8.0, 30.0)
 NOISES_M = (0.005, 0.02, 0.05)
 CELLS = tuple(Cell(density_per_m2=density, noise_m=noise) for density in DENSITIES_PER_M2 for noise in NOISES_M)
 
-_STRIP_M, _MARGIN_M = 150.0, 4.0
 _CLEAR_M = 0.4
 """Free roof between a dormer and the eave, the ridge or another dormer."""
 _TRIES = 100
@@ -197,25 +194,4 @@ FORMS: dict[BrokenForm, Callable[[np.random.Generator], Parts]] = {
 
 def broken_slopes(seed: int) -> Scene:
     """Four buildings of each form on plots of their own on nearly level ground."""
-    random = np.random.default_rng([seed, 0xB5])
-    planned = [
-        PlannedRoof.over(
-            FORMS[form](random),
-            f"{form}-{number}",
-            azimuth_deg=_drawn(random, 0.0, 360.0),
-            eave_height_m=_drawn(random, 3.0, 7.0),
-            margin_m=_MARGIN_M,
-            shape=form,
-        )
-        for form in FORMS
-        for number in range(OF_EACH)
-    ]
-    plots, extent = packed_plots([one.box for one in planned], _STRIP_M, 1)
-    terrain = undulating_terrain(40.0, 1.0, _drawn(random, 0.0, 360.0), 0.4, 150.0, random)
-    return Scene(
-        name="broken_slopes",
-        origin=(572_000.0, 5_941_000.0, 0.0),
-        extent=(0.0, 0.0, *extent),
-        terrain=terrain,
-        buildings=tuple(one.built(plot, terrain) for one, plot in zip(planned, plots, strict=True)),
-    )
+    return scene_of_forms("broken_slopes", FORMS, np.random.default_rng([seed, 0xB5]), 5_941_000.0)

@@ -11,19 +11,16 @@ from collections.abc import Callable
 import numpy as np
 
 from pipeline.ruler.simulation.envelope import Line, Place, RoofPart
-from pipeline.ruler.simulation.plots import PlannedRoof, packed_plots
+from pipeline.ruler.simulation.plots import scene_of_forms
 from pipeline.ruler.simulation.roof_dimensions import CurvedForm
 from pipeline.ruler.simulation.roof_parts import rectangle
-from pipeline.ruler.simulation.simulated_scene import Scene, undulating_terrain
+from pipeline.ruler.simulation.simulated_scene import Scene
 from pipeline.ruler.simulation.sweep import Cell
 
-OF_EACH = 4
-"""Buildings of each form in a scene."""
 CELLS = tuple(
     Cell(density_per_m2=density, noise_m=noise) for density in (2.0, 8.0, 30.0) for noise in (0.01, 0.02, 0.05)
 )
 
-_STRIP_M, _MARGIN_M = 150.0, 4.0
 _SECTORS, _RINGS, _STRIPS = 36, 9, 40
 _STEEPEST_DEG = 80.0
 """Slope of the lowest planes of a half circle."""
@@ -117,25 +114,4 @@ FORMS: dict[CurvedForm, Callable[[np.random.Generator], list[RoofPart]]] = {
 
 def curved_roofs(seed: int) -> Scene:
     """Four buildings of each form on plots of their own on nearly level ground."""
-    random = np.random.default_rng([seed, 0xC5])
-    planned = [
-        PlannedRoof.over(
-            FORMS[form](random),
-            f"{form}-{number}",
-            azimuth_deg=_drawn(random, 0.0, 360.0),
-            eave_height_m=_drawn(random, 3.0, 7.0),
-            margin_m=_MARGIN_M,
-            shape=form,
-        )
-        for form in FORMS
-        for number in range(OF_EACH)
-    ]
-    plots, extent = packed_plots([one.box for one in planned], _STRIP_M, 1)
-    terrain = undulating_terrain(40.0, 1.0, _drawn(random, 0.0, 360.0), 0.4, 150.0, random)
-    return Scene(
-        name="curved_roofs",
-        origin=(572_000.0, 5_942_000.0, 0.0),
-        extent=(0.0, 0.0, *extent),
-        terrain=terrain,
-        buildings=tuple(one.built(plot, terrain) for one, plot in zip(planned, plots, strict=True)),
-    )
+    return scene_of_forms("curved_roofs", FORMS, np.random.default_rng([seed, 0xC5]), 5_942_000.0)

@@ -3,14 +3,26 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
 from pipeline.model import FloatArray
 from pipeline.ruler.simulation.envelope import RoofPart, envelope
 from pipeline.ruler.simulation.roofs import ROOFS, BrokenForm, CurvedForm, RoofDimensions, RoofFaces, RoofShape
-from pipeline.ruler.simulation.simulated_scene import Building, Terrain, face_plane, place_building, turned
+from pipeline.ruler.simulation.simulated_scene import (
+    Building,
+    Scene,
+    Terrain,
+    face_plane,
+    place_building,
+    turned,
+    undulating_terrain,
+)
+
+OF_EACH = 4
+"""Buildings of each form in a scene of all forms of a suite."""
+_STRIP_M, _MARGIN_M = 150.0, 4.0
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -136,3 +148,34 @@ def packed_plots(
         y += depth
         longest = max(longest, y)
     return [plots[number] for number in range(len(buildings))], (strips * strip_width_m, float(np.ceil(longest)))
+
+
+def scene_of_forms(
+    name: str,
+    forms: Mapping[BrokenForm, Callable[[np.random.Generator], list[RoofPart]]]
+    | Mapping[CurvedForm, Callable[[np.random.Generator], list[RoofPart]]],
+    random: np.random.Generator,
+    north_m: float,
+) -> Scene:
+    """Four buildings of each form on plots of their own on nearly level ground; their ids are FORM-NUMBER."""
+    planned = [
+        PlannedRoof.over(
+            parts_of(random),
+            f"{form}-{number}",
+            azimuth_deg=float(random.uniform(0.0, 360.0)),
+            eave_height_m=float(random.uniform(3.0, 7.0)),
+            margin_m=_MARGIN_M,
+            shape=form,
+        )
+        for form, parts_of in forms.items()
+        for number in range(OF_EACH)
+    ]
+    plots, extent = packed_plots([one.box for one in planned], _STRIP_M, 1)
+    terrain = undulating_terrain(40.0, 1.0, float(random.uniform(0.0, 360.0)), 0.4, 150.0, random)
+    return Scene(
+        name=name,
+        origin=(572_000.0, north_m, 0.0),
+        extent=(0.0, 0.0, *extent),
+        terrain=terrain,
+        buildings=tuple(one.built(plot, terrain) for one, plot in zip(planned, plots, strict=True)),
+    )

@@ -118,3 +118,15 @@ def test_a_slope_between_two_levels_needs_more_than_a_row_of_points(width_m: flo
     assert usable.tolist() == [True, stays]
     top = np.abs(y - width_m) < 0.1
     assert (labels[top] == (1 if stays else -1)).all()
+
+
+def test_a_row_of_points_stays_where_no_other_plane_is_left() -> None:
+    along = np.arange(0.0, 7.0, 0.35)
+    row = np.column_stack([along, np.full(20, 0.3), np.full(20, 9.8)])
+    points = np.concatenate([[(k, 0.0, 9.0) for k in range(4)], row])
+    planes = np.array([[0.0, 0.0, 9.0], [0.0, 0.8 / 0.3, 9.0]])
+    labels = np.repeat(np.array([0, 1], np.int32), [4, 20])
+    usable = np.ones(2, np.bool_)
+    dissolve_redundant(points, nearest_neighbours(points, 8), labels, planes, usable, 0.15, 5.0, 0.5)
+    assert usable.tolist() == [False, True]
+    assert (labels == 1).all()

@@ -6,7 +6,8 @@ import shapely
 
 from pipeline.roof.roof_settings import RoofTypeSettings
 from pipeline.roof.roof_type import roof_type
-from pipeline.ruler.simulation.broken_slopes import FORMS, OF_EACH, broken_slopes
+from pipeline.ruler.simulation.broken_slopes import FORMS, broken_slopes
+from pipeline.ruler.simulation.plots import OF_EACH
 from pipeline.ruler.simulation.roofs import ROOF_TYPES, BrokenForm
 from pipeline.ruler.simulation.simulated_scene import Building, Scene
 from pipeline.ruler.simulation.solids import truth_record

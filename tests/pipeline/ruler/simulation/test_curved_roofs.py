@@ -5,7 +5,8 @@ import pytest
 import shapely
 
 from pipeline.model import RoofType
-from pipeline.ruler.simulation.curved_roofs import FORMS, OF_EACH, curved_roofs
+from pipeline.ruler.simulation.curved_roofs import FORMS, curved_roofs
+from pipeline.ruler.simulation.plots import OF_EACH
 from pipeline.ruler.simulation.roofs import ROOF_TYPES, CurvedForm
 from pipeline.ruler.simulation.simulated_scene import Scene
 from pipeline.ruler.simulation.solids import truth_record
