@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import dataclasses
 import fcntl
 import os
@@ -39,8 +40,7 @@ _TICK_S = 0.05
 _CANCEL_TICK_S = 0.25
 _TRACE_WAIT_S = 2.0
 _STDERR_KEPT_BYTES = 8 * 2**20
-_CUTS = 5
-"""Trials to cut its standard error while it writes nothing."""
+_PUNCH_HOLE = 1 | 2  # FALLOC_FL_KEEP_SIZE | FALLOC_FL_PUNCH_HOLE
 _STDERR_REPORTED_BYTES = 6000
 _DATA_MARGIN_BYTES = 2**30
 """Allowance above the limit: a process reserves more address space than it uses."""
@@ -338,16 +338,16 @@ class SupervisedChild:
 
     def _cut_stderr(self) -> None:
         """Keep a child from filling the disk: only the end of its standard error stays."""
-        for trial in range(_CUTS):
-            size = os.fstat(self._stderr.fileno()).st_size
-            if size <= _STDERR_KEPT_BYTES:
-                return
+        found = os.fstat(self._stderr.fileno())
+        if found.st_blocks * 512 <= _STDERR_KEPT_BYTES:
+            return
+        freed = found.st_size - _STDERR_REPORTED_BYTES
+        if free_beginning(self._stderr.fileno(), freed):
+            self._read_bytes = max(self._read_bytes, freed)
+        else:
             tail = self._end_of_stderr()
-            # what it wrote meanwhile would be lost, and may be its last words
-            if os.fstat(self._stderr.fileno()).st_size == size or trial == _CUTS - 1:
-                os.ftruncate(self._stderr.fileno(), 0)
-                os.write(self._stderr.fileno(), tail)
-                return
+            os.ftruncate(self._stderr.fileno(), 0)
+            os.write(self._stderr.fileno(), tail)
 
     def _end_of_stderr(self) -> bytes:
         size = os.fstat(self._stderr.fileno()).st_size
@@ -363,6 +363,15 @@ class SupervisedChild:
     def last_output(self) -> str:
         """The end of its standard error."""
         return self._end_of_stderr().decode("utf-8", errors="replace").strip()
+
+
+def free_beginning(descriptor: int, size: int) -> bool:
+    """Free the disk beneath the first bytes of a file, which then read as zeros; False where that cannot be done.
+
+    The file keeps its size, so what another process appends meanwhile stays.
+    """
+    fallocate = getattr(ctypes.CDLL(None), "fallocate", None)
+    return fallocate is not None and fallocate(descriptor, _PUNCH_HOLE, ctypes.c_int64(0), ctypes.c_int64(size)) == 0
 
 
 def system_kills() -> int:

@@ -25,6 +25,7 @@ from pipeline.runtime.isolation import child_main, child_pool
 from pipeline.runtime.isolation.child_messages import Frames, frame
 from pipeline.runtime.isolation.isolated_items import supervise
 from pipeline.runtime.isolation.process_limits import IsolationLimits, Loss
+from pipeline.runtime.isolation.supervision import free_beginning
 from pipeline.runtime.monitoring.progress import Event
 
 LIMITS = IsolationLimits(timeout_s=120.0, memory_bytes=2**30)
@@ -193,6 +194,18 @@ def test_only_the_end_of_a_childs_output_is_kept(orders: Order) -> None:
     _, loss = outcomes(orders, [loud, loud + "\nprint('last words', flush=True); os.abort()"])
     assert "last words" in loss.stderr
     assert len(loss.stderr) <= 6000
+
+
+def test_what_a_child_appends_stays_when_the_beginning_of_its_output_is_freed(tmp_path: Path) -> None:
+    path = tmp_path / "stderr"
+    path.write_bytes(b"y" * 2**22 + b"words")
+    with path.open("rb+") as file, path.open("ab") as other:
+        other.write(b", last")  # after the size was read, as by a child
+        other.flush()
+        assert free_beginning(file.fileno(), 2**22)
+    assert path.stat().st_size == 2**22 + len(b"words, last")
+    assert path.stat().st_blocks * 512 < 2**20
+    assert path.read_bytes().endswith(b"\0words, last")
 
 
 def test_an_error_of_the_function_is_raised_here(orders: Order) -> None:
